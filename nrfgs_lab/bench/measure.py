@@ -40,8 +40,8 @@ def measure(config_path: Path, train_views: int, timed: bool = True) -> dict[str
     Returns:
         "test" and "train" (null without views), each with "per_image" and means of psnr, ssim, ms_ssim, l1, lpips (null
         without weights), flip (null without `flip-evaluator`), colour-corrected cc_psnr, ...; "fps" at the photographs'
-        size and "fps_1080p" (null on a CPU), null if not timed; "splats", of which "diffuse" have no residual;
-        "parameter_bytes" of a renderer; "checkpoint_bytes" with the optimisers' moments.
+        size and "fps_1080p" (null on a CPU), null if not timed; "splats"; "parameter_bytes" of a renderer;
+        "checkpoint_bytes" with the optimisers' moments.
     """
     _, pipeline, checkpoint, _ = eval_setup(Path(config_path))
     model, data = pipeline.model, pipeline.datamanager
@@ -58,13 +58,11 @@ def measure(config_path: Path, train_views: int, timed: bool = True) -> dict[str
         result["train"] = over_views(model, zip(names, views, strict=True))
     cameras = [camera for camera, _ in test]
     large = [at_size(camera, *FULL_HD) for camera in cameras]
-    diffuse = getattr(getattr(model, "densification", None), "diffuse", None)  # nerfstudio's own have none
     return {
         **result,
         "fps": frames_per_second(model, cameras) if timed else None,
         "fps_1080p": frames_per_second(model, large) if timed and model.device.type == "cuda" else None,
         "splats": int(model.num_points),
-        "diffuse": 0 if diffuse is None else int(diffuse.sum()),
         "parameter_bytes": getattr(model, "parameter_bytes", None)  # nerfstudio's own have splats and no more
         or sum(parameter.numel() * parameter.element_size() for parameter in model.gauss_params.values()),
         "checkpoint_bytes": Path(checkpoint).stat().st_size,

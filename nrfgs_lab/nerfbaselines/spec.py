@@ -10,7 +10,7 @@ from nerfbaselines import register
 METHODS = {
     "nrfgs": ("Nrfgs", "NRF-GS", "A neural residual field adds what depends on the view to base colour and opacity."),
     "nrfgs-fast": ("NrfgsFast", "NRF-GS fast", "NRF-GS in 10,000 steps, its schedules shortened to them."),
-    "nrfgs-best": ("NrfgsBest", "NRF-GS best", "NRF-GS with the densification of 3DGS."),
+    "nrfgs-best": ("NrfgsBest", "NRF-GS best", "NRF-GS with more splats."),
     "nrfgs-sh": ("NrfgsSh", "NRF-GS host with SH", "The same host with spherical harmonics of degree 3, as in 3DGS."),
     "nrfgs-vdgs": ("NrfgsVdgs", "NRF-GS host with VDGS", "The same host; opacity depends on the view as in VDGS."),
     "nrfgs-gsnb": ("NrfgsGsnb", "NRF-GS host with GSNB", "The same host; directions have a learnt basis as in GSNB."),

@@ -4,7 +4,6 @@
 Every check raises InputError with the file or field, its content, and the fix. `source` is the file that messages name.
 """
 
-import json
 import math
 import os
 from collections import Counter
@@ -18,10 +17,6 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from nrfgs_ns.data.pictures import read_size
 from nrfgs_ns.errors import InputError
 
-LONGEST_JSON = 2**26
-"""Largest transforms.json, bytes: a hundred thousand frames."""
-PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".heic", ".dng")
-"""Suffixes of a camera's files."""
 SHOWN, LONGEST = 3, 160
 """Items that a message lists before it counts the rest, and characters of each."""
 
@@ -57,34 +52,6 @@ def matrix(value: Any) -> np.ndarray:
         return np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         return np.empty(0)
-
-
-def read_transforms(data: Path) -> tuple[dict[str, Any], Path]:
-    """The content of the transforms.json of `data`, a folder or the file itself, with at least one frame; its path."""
-    if not os.path.exists(data):
-        raise InputError(f"{shown(str(data))}: no such file or folder. Check the path that --data names.")
-    source = data if data.suffix == ".json" else data / "transforms.json"
-    if not source.is_file():
-        raise InputError(f"{source} is missing. {_advice_without_transforms(data)}")
-    if source.stat().st_size > LONGEST_JSON:
-        raise InputError(f"{source} is larger than {LONGEST_JSON} bytes. Make it anew.")
-    try:
-        meta = json.loads(source.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{source} cannot be read as JSON: {error}. Repair the file or make it anew.") from error
-    frames = meta.get("frames") if isinstance(meta, dict) else None
-    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
-        raise InputError(f"{source}: `frames` must be a non-empty list of objects. Make the file anew.")
-    return meta, source
-
-
-def _advice_without_transforms(folder: Path) -> str:
-    if folder.is_dir():
-        if model := find_colmap(folder):
-            return f"There is a COLMAP model: put `colmap --colmap-path {model}` at the end of the command."
-        if any(file.suffix.lower() in PHOTOGRAPHS for pattern in ("*", "images/*") for file in folder.glob(pattern)):
-            return f"For photographs without poses: run `nrfgs prepare {folder} SCENE`, then train on SCENE."
-    return "Point --data at a folder that holds one; `nrfgs prepare PHOTOS SCENE` makes one from photographs."
 
 
 def find_colmap(folder: Path) -> str | None:

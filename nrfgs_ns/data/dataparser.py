@@ -4,6 +4,8 @@
 COLMAP models (`colmap_parser.py`) become the dictionary of a transforms.json, so that checks and cameras are the same.
 """
 
+import json
+import os
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -33,8 +35,8 @@ from nrfgs_ns.data.checks import (
     check_headers,
     check_options,
     check_unique,
+    find_colmap,
     number,
-    read_transforms,
     shown,
     warn,
 )
@@ -47,6 +49,10 @@ from nrfgs_ns.start import with_data_parsers
 
 with_data_parsers()
 
+LONGEST_JSON = 2**26
+"""Largest transforms.json, bytes: a hundred thousand frames."""
+PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".heic", ".dng")
+"""Suffixes of a camera's files."""
 MIN_POINTS = 4
 """Fewer points cannot start a training: a splat's first size is its distance to its three nearest neighbours."""
 ORIENTATIONS = ("pca", "up", "vertical", "none")
@@ -297,6 +303,34 @@ class NrfgsDataParser(DataParser):
         if self._colmap.is_dir():
             return *read_colmap(self._colmap), after(scene.transform, scene.to_frames)
         return None
+
+
+def read_transforms(data: Path) -> tuple[dict[str, Any], Path]:
+    """The content of the transforms.json of `data`, a folder or the file itself, with at least one frame; its path."""
+    if not os.path.exists(data):
+        raise InputError(f"{shown(str(data))}: no such file or folder. Check the path that --data names.")
+    source = data if data.suffix == ".json" else data / "transforms.json"
+    if not source.is_file():
+        raise InputError(f"{source} is missing. {_advice_without_transforms(data)}")
+    if source.stat().st_size > LONGEST_JSON:
+        raise InputError(f"{source} is larger than {LONGEST_JSON} bytes. Make it anew.")
+    try:
+        meta = json.loads(source.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{source} cannot be read as JSON: {error}. Repair the file or make it anew.") from error
+    frames = meta.get("frames") if isinstance(meta, dict) else None
+    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+        raise InputError(f"{source}: `frames` must be a non-empty list of objects. Make the file anew.")
+    return meta, source
+
+
+def _advice_without_transforms(folder: Path) -> str:
+    if folder.is_dir():
+        if model := find_colmap(folder):
+            return f"There is a COLMAP model: put `colmap --colmap-path {model}` at the end of the command."
+        if any(file.suffix.lower() in PHOTOGRAPHS for pattern in ("*", "images/*") for file in folder.glob(pattern)):
+            return f"For photographs without poses: run `nrfgs prepare {folder} SCENE`, then train on SCENE."
+    return "Point --data at a folder that holds one; `nrfgs prepare PHOTOS SCENE` makes one from photographs."
 
 
 nrfgs_dataparser = DataParserSpecification(

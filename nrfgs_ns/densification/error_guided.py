@@ -97,8 +97,7 @@ class ErrorGuided(DensificationConfig):
         return replace(self, **shares)
 
     def build(self, num_images: int, num_views: int, scene_unit: float) -> "ErrorGuidedDensification":
-        raised = self.threshold * (1 + (num_views / MANY_VIEWS) ** 2)
-        return ErrorGuidedDensification(replace(self, threshold=raised))
+        return ErrorGuidedDensification(self, self.threshold * (1 + (num_views / MANY_VIEWS) ** 2))
 
 
 class ErrorGuidedDensification(Densification):
@@ -107,14 +106,14 @@ class ErrorGuidedDensification(Densification):
     name = ErrorGuided.name
     takes_all_rows = True
 
-    def __init__(self, config: ErrorGuided):
+    def __init__(self, config: ErrorGuided, raised: float):
         super().__init__(config.opacity_seen)
         self.state |= {ERROR: None, WIDTH: None}
         if config.budget:
             self.state[FIRST] = None
         if config.opacity_seen == "peak":
             self.state[CHANGE_BEFORE] = None
-        self.config, self.budget = config, config.budget
+        self.config, self.raised, self.budget = config, raised, config.budget
         self.reschedule(round)
 
     def reschedule(self, step_at: Callable[[float], int]) -> None:
@@ -204,7 +203,7 @@ class ErrorGuidedDensification(Densification):
             self.state[FIRST] = first = self.state[FIRST] or count
             x = min((step - self.start) / max(self.grow_until - self.start - self.config.refine_every, 1), 1.0)
             return error.masked_fill(wide, math.inf), round(first + (2 * x - x * x) * (budget - first)) - count
-        weights = error * (error > self.config.threshold)
+        weights = error * (error > self.raised)
         wanted = max(round(SHARE * int((weights > 0).sum())) - replaced, int(wide.sum()))
         return weights.masked_fill(wide, math.inf), wanted
 
@@ -276,7 +275,7 @@ def split(splats: Splats, optimizers: Optimizers, rows: Tensor, places: Tensor) 
             return old[rows] + sign * half["offset"]
         return half[name] if name in half else old[rows]
 
-    def overwrite(name: str, table: Tensor) -> None:
+    def overwrite(name: str, table: Tensor) -> Tensor:
         first, second = values(name, table, 1.0), values(name, table, -1.0)
         table[rows] = first
         table[places] = second[:taken]

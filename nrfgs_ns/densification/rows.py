@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which splats a model's table has, and in which order: all that has a row for each of them follows."""
+"""Choosing and ordering the rows of a table of splats, with the optimisers' moments and what a strategy remembers."""
 
 from collections.abc import Mapping
 from typing import Any

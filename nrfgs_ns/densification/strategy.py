@@ -2,7 +2,7 @@
 """The interface of all strategies of densification: their options, and what runs in training.
 
 A strategy is a dataclass of its options (`DensificationConfig`), which builds what runs (`Densification`). What it
-wants of the head or of the loss it says itself. A new one is one file, and its name in `choice.py`.
+wants of the head or of the loss it says itself. A new one is one file, and its name in `__init__.py`.
 """
 
 import math

@@ -167,10 +167,9 @@ class ShardedModel(NrfgsModel):
     def _screen_info(self) -> dict[str, Any]:
         """`info` as densification reads it, for a step of W cameras.
 
-        gsplat multiplies gradients by half the image's sides and by the number of cameras, which undoes the mean of the
-        losses: each (camera, splat) pair counts as in a step of its own. Where cameras differ in size, gradients and
-        radii are brought to that of the first here. gsplat would keep any one of a splat's radii; here all are the
-        largest.
+        The statistics multiply gradients by the number of cameras, which undoes the mean of the losses: each (camera,
+        splat) pair counts as in a step of its own. Where cameras differ in size, gradients and radii are brought to
+        that of the first. Of a splat's radii all are the largest.
         """
         info = self.info
         width, height = self.sizes[0]

@@ -9,7 +9,7 @@ name: `!!python/object/apply:os.system` in a shared file is run. Here a file may
     paths, tuples, and enums of either package
 
 and anything else is refused with its line. Values are checked against the types of the dataclasses' fields; an option
-that is newer than the file has its default. Read in: nerfstudio 1.1.5, PyYAML 6.
+that is newer than the file has its default. Written for what nerfstudio 1.1.5 saves by PyYAML 6.
 """
 
 import importlib

@@ -49,7 +49,9 @@ class StepGraphs:
         self.model, self.datamanager, self.guard = model, datamanager, guard
         self._graphs: dict[tuple, _StepGraph] = {}
         self._of: list[Any] = []
+        """the splats' parameters and the head that were recorded"""
         self._how: dict[str, Any] = {}
+        """what else differs between recordings: phases, places in memory, the resolution"""
         self._pairs_for_each = 0.0
         """the most pairs of a view, for each splat, at this resolution"""
         self._given_up = False

@@ -236,7 +236,7 @@ def _backward_block(
     return F.embedding_bag(row_of_slot[:-1], gradients, lists.splat_start, mode="sum")
 
 
-class _Composite(torch.autograd.Function):
+class CompositeSplats(torch.autograd.Function):
     """(means2d, conics, opacities, colors) -> (render [C, H, W, D], transmittance [C, H, W, 1])."""
 
     @staticmethod
@@ -282,24 +282,3 @@ class _Composite(torch.autograd.Function):
         grad_opacities = total[:, 5] / opacities.where(opacities > 0, 1.0)
         grad_colors = total[:, 6 : 6 + channels]
         return total[:, :2].contiguous(), total[:, 2:5].contiguous(), grad_opacities, grad_colors, None, None
-
-
-def composite(
-    projection: Projection,
-    colors: Tensor,
-    opacities: Tensor,
-    backgrounds: Tensor | None,
-    absgrad: bool,
-    leave_out: bool,
-) -> tuple[Tensor, Tensor, dict]:
-    """Render [C, H, W, D] over backgrounds [C, D], alphas [C, H, W, 1], and no lists to add to `info`."""
-    tables = projection.means2d, projection.conics, opacities, colors
-    render, transmittance = _Composite.apply(*tables, projection, absgrad)
-    if backgrounds is not None:
-        render = render + transmittance * backgrounds[:, None, None, :]
-    return render, 1 - transmittance, {}
-
-
-def leaves_out(*_) -> bool:
-    """Whether `composite` can leave out rows that are not finite."""
-    return False

@@ -36,7 +36,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .. import EPS2D, Projection, ProjectionOptions
+from .. import EPS2D, ProjectionOptions
 
 FOV_MARGIN = 0.3  # how far beyond the image edge J may be evaluated, in units of tan(fov / 2)
 RADIUS_SIGMAS = 3.0  # a splat ends at this many standard deviations
@@ -145,7 +145,7 @@ def _visible(screen: _Screen, radii: Tensor, width: int, height: int, options: P
     return visible & (x + radii > 0) & (x - radii < width) & (y + radii > 0) & (y - radii < height)
 
 
-class _Project(torch.autograd.Function):
+class ProjectSplats(torch.autograd.Function):
     """(means, quats, scales, viewmat) of one camera -> ids, radii, and means2d, depths, conics, compensations.
 
     Visibility is decided for all splats; the backward pass looks at the visible ones only, so that a culled splat can
@@ -240,15 +240,3 @@ def _back_to_quats(screen: _Screen, by_rotations: Tensor, quats: Tensor) -> Tens
     )
     tangent = by_unit - screen.directions * (screen.directions * by_unit).sum(0)
     return tangent.t() / quats.norm(dim=-1, keepdim=True)
-
-
-def project(geometry: tuple[Tensor, ...], cameras: tuple, options: ProjectionOptions) -> Projection:
-    """See `nrfgs_ns.rasterizer.project`: means, quats, scales; viewmats, Ks, width, height."""
-    viewmats, Ks, width, height = cameras
-    cameras = zip(viewmats, Ks, strict=True)
-    projected = [_Project.apply(*geometry, *camera, (width, height), options) for camera in cameras]
-    ids, *columns, compensations = (torch.cat(rows) for rows in zip(*projected, strict=True))
-    camera_ids = torch.cat([torch.full_like(camera[0], index) for index, camera in enumerate(projected)])
-    if options.rasterize_mode != "antialiased":
-        compensations = None
-    return Projection(camera_ids, ids, *columns, compensations, width, height, n_cameras=len(viewmats))
