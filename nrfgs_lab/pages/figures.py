@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The figures of the pages, from the records in results/, as SVG that follows the reader's dark or light setting.
+
+python -m nrfgs_lab.pages.figures            # writes docs/images/views.svg
+"""
+
+import math
+from statistics import median
+
+from nrfgs_lab.pages.few_views import FIELD, SAME, today
+from nrfgs_lab.pages.runs import ROOT, VIEWS, view_gains
+from nrfgs_ns.files import write_whole
+
+WIDTH, LEFT, ROW = 640, 130, 34
+STYLE = """text { font: 15px sans-serif; fill: #1f2328 } .rule { stroke: #59636e } .faint { stroke: #d1d9e0 }
+.better { fill: #0969da } .worse { fill: #bc4c00 }
+@media (prefers-color-scheme: dark) { text { fill: #f0f6fc } .rule { stroke: #9198a1 } .faint { stroke: #3d444d }
+.better { fill: #4493f8 } .worse { fill: #db6d28 } }"""
+
+
+def views() -> str:
+    """Gain of the field over harmonics with the same rules in each test view, a dot each; bars are medians."""
+    gains = {scene: view_gains(today(scene, FIELD), today(scene, SAME)) for scene in VIEWS}
+    least, most = (math.floor(min(map(min, gains.values()))), math.ceil(max(map(max, gains.values()))))
+    height = ROW * len(gains) + 50
+
+    def x(gain: float) -> float:
+        return round(LEFT + (gain - least) / (most - least) * (WIDTH - LEFT - 15), 1)
+
+    parts = [f'<line class="faint" x1="{x(g)}" x2="{x(g)}" y1="8" y2="{height - 42}"/>' for g in range(least, most + 1)]
+    for row, (scene, values) in enumerate(gains.items()):
+        y, middle = ROW * row + 25, x(median(values))
+        parts.append(f'<text x="4" y="{y + 5}">{scene}, {VIEWS[scene]}</text>')
+        kinds = ((value, "better" if value > 0 else "worse") for value in values)
+        parts += [f'<circle class="{kind}" cx="{x(v)}" cy="{y}" r="5" fill-opacity="0.55"/>' for v, kind in kinds]
+        parts.append(f'<line class="rule" stroke-width="3" x1="{middle}" x2="{middle}" y1="{y - 12}" y2="{y + 12}"/>')
+    parts.append(f'<line class="rule" x1="{x(0)}" x2="{x(0)}" y1="8" y2="{height - 42}"/>')
+    ticks = [gain for gain in range(least, most + 1) if gain % 2 == 0]
+    parts += [
+        f'<text x="{x(g)}" y="{height - 25}" text-anchor="middle">{g:+d}</text>'.replace("+0", "0") for g in ticks
+    ]
+    parts.append(f'<text x="{(LEFT + WIDTH) / 2}" y="{height - 5}" text-anchor="middle">field - harmonics, dB</text>')
+    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}">\n<style>{STYLE}</style>'
+    return "\n".join([head, *parts, "</svg>", ""])
+
+
+FIGURES = {"views.svg": views}
+
+if __name__ == "__main__":
+    for name, draw in FIGURES.items():
+        write_whole(ROOT / "docs" / "images" / name, draw())
