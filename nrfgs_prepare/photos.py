@@ -15,7 +15,7 @@ import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
 from nrfgs_ns.data.pictures import (
-    FORMATS,
+    HEIF,
     NUMBERS,
     check_depth,
     exif_of,
@@ -27,10 +27,7 @@ from nrfgs_ns.data.pictures import (
 from nrfgs_ns.errors import InputError
 from nrfgs_prepare.pairs import Advance
 
-PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
-HEIF = (".heic", ".heif")
-"""Suffixes that are read if pillow-heif is installed."""
-CONVERT = "To read HEIC, run `pip install pillow-heif`, or convert it to JPEG (`heif-convert`, or the phone's export)."
+PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", *HEIF)
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 KEPT = (".jpg", ".jpeg", ".png")
 """Suffixes of files that are copied; others become PNG."""
@@ -47,16 +44,6 @@ LONGEST_STEM = 120
 """Maximum length of a stored name, letters."""
 
 
-def reads_heif() -> bool:
-    """Whether PIL reads HEIC, by pillow-heif."""
-    try:
-        import pillow_heif
-    except ImportError:
-        return False
-    pillow_heif.register_heif_opener()
-    return True
-
-
 def find_inputs(source: Path) -> list[Path]:
     """The photographs of a folder by sorted name, or a video as a list of one; InputError without enough of them."""
     if source.is_file():
@@ -70,9 +57,10 @@ def find_inputs(source: Path) -> list[Path]:
             f"{source} is a scene already: its transforms.json has the poses. Train with `ns-train nrfgs --data "
             f"{shlex.quote(str(source))}`, or name its folder of photographs."
         )
-    suffixes = (*PHOTOS, *HEIF) if reads_heif() else PHOTOS
     files = sorted(path for path in source.iterdir() if path.is_file() and not path.name.startswith("."))
-    photos = [path for path in files if path.suffix.lower() in suffixes]
+    photos = [path for path in files if path.suffix.lower() in PHOTOS]
+    if heif := next((path for path in photos if path.suffix.lower() in HEIF), None):
+        open_picture(heif).close()  # reports a missing pillow-heif before any work
     if len(photos) < FEWEST:
         raise InputError(
             f"{source} directly holds {len(photos)} photographs ({', '.join(PHOTOS)}); at least {FEWEST} are needed, "
@@ -86,7 +74,7 @@ def left_out(source: Path, photos: list[Path]) -> str:
     """A sentence about other contents of a folder, by suffix; "" without any."""
     others = [path for path in source.iterdir() if not path.name.startswith(".") and path not in set(photos)]
     kinds = {"folders" if path.is_dir() else path.suffix.lower() or "no suffix" for path in others}
-    hint = CONVERT if kinds & set(HEIF) else "To use a video, name that file itself." if kinds & set(VIDEOS) else ""
+    hint = "To use a video, name that file itself." if kinds & set(VIDEOS) else ""
     return f"Left out, since they are not read here: {', '.join(sorted(kinds))}. {hint}" if kinds else ""
 
 
@@ -120,7 +108,7 @@ def import_photos(photos: list[Path], folder: Path, advance: Advance) -> None:
         target = folder / name
         if not target.exists():
             aside = folder.with_name("photo" + target.suffix)  # so that a cut copy is not taken for a whole one
-            with open_picture(path, (*FORMATS, "HEIF") if path.suffix.lower() in HEIF else FORMATS) as image:
+            with open_picture(path) as image:
                 _store(image, path, aside)
             os.replace(aside, target)
         advance(1)

@@ -106,6 +106,17 @@ def no_cuda(monkeypatch):
 
 
 @pytest.fixture
+def no_heif(monkeypatch):
+    """Hide pillow-heif."""
+    from nrfgs_ns.data.pictures import reads_heif
+
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    reads_heif.cache_clear()
+    yield
+    reads_heif.cache_clear()
+
+
+@pytest.fixture
 def capture(tmp_path):
     """A capture of ten images (`small_capture.Capture`)."""
     from small_capture import Capture

@@ -7,6 +7,7 @@ import os
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,6 +19,8 @@ from nrfgs_ns.errors import InputError
 
 FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP", "PPM")
 """Formats that PIL may open, by a file's first bytes; for some others it would start Ghostscript."""
+HEIF = (".heic", ".heif")
+"""Suffixes of files that may also be HEIF, which pillow-heif reads for PIL."""
 MASK_MODES = ("1", "L", "I", "I;16")
 """PIL modes of masks: one value for each pixel, no palette index."""
 HALF = 127
@@ -28,10 +31,26 @@ BYTES_PER_PIXEL = 16
 Result = TypeVar("Result")
 
 
-def open_picture(path: Path, formats: Sequence[str] = FORMATS) -> Image.Image:
-    """An image whose header alone is read; InputError if it is not of these formats."""
+@cache
+def reads_heif() -> bool:
+    """Whether PIL reads HEIF, from now on."""
+    try:
+        import pillow_heif
+    except ImportError:
+        return False
+    pillow_heif.register_heif_opener()
+    return True
+
+
+def open_picture(path: Path) -> Image.Image:
+    """An image whose header alone is read; InputError if it is of no known format."""
+    heif = path.suffix.lower() in HEIF
+    if heif and not reads_heif():
+        raise InputError(
+            f"{path} is a HEIC photograph, not read here: run `pip install pillow-heif`, or convert it to JPEG."
+        )
     with naming(path, "is not a readable image"):
-        return Image.open(path, formats=formats)
+        return Image.open(path, formats=(*FORMATS, "HEIF") if heif else FORMATS)
 
 
 @contextlib.contextmanager

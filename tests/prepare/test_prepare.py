@@ -248,15 +248,33 @@ def test_global_mapping_helps_out_and_finds_the_same(prepared, walls, tmp_path, 
         (lambda d: None, "no such folder"),
         (lambda d: photo(d / "more" / "a.jpg"), "directly holds 0 photographs"),
         (lambda d: (d.mkdir(), (d / "a.mp4").touch()), "name that file itself"),
-        (lambda d: [photo(d / "a.jpg"), (d / "b.HEIC").touch()], "1 photographs .*at least 3.*pip install pillow-heif"),
+        (lambda d: [photo(d / "a.jpg"), (d / "b.HEIC").touch()], "b.HEIC is .*: run `pip install pillow-heif`"),
         (lambda d: (photo(d / "images" / "a.jpg"), (d / "transforms.json").touch()), "scene already.*ns-train nrfgs"),
         (lambda d: d.write_text("no video"), "neither a folder of photographs nor a video"),
     ],
 )
-def test_inputs_that_cannot_do_are_refused(make, said, tmp_path):
+def test_inputs_that_cannot_do_are_refused(make, said, tmp_path, no_heif):
     make(tmp_path / "in")
     with pytest.raises(InputError, match=said):
         photos.find_inputs(tmp_path / "in")
+
+
+def test_photographs_of_an_iphone_are_stored_upright(three):
+    pillow_heif = pytest.importorskip("pillow_heif", reason="needs pillow-heif")
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.ExposureTime] = IFDRational(1, 50)
+    halves = Image.new("RGB", (40, 20), "red")
+    halves.paste("blue", (0, 0, 20, 20))
+    pillow_heif.from_pillow(halves).save(three / "IMG_0.HEIC", exif=exif.tobytes(), quality=100)
+    inputs = photos.find_inputs(three)
+    assert [path.name for path in inputs] == ["0.png", "1.png", "2.png", "IMG_0.HEIC"]
+    photos.import_photos(inputs, three / "stored", lambda _: None)
+    assert photos.read_exif(three / "stored" / "IMG_0.png") == {"exposure_time": pytest.approx(1 / 50)}
+    with Image.open(three / "stored" / "IMG_0.png") as stored:
+        assert stored.size == (20, 40) and stored.getexif().get(ExifTags.Base.Orientation, 1) == 1
+        top, bottom = np.asarray(stored)[[2, -3], 10].astype(int)
+        np.testing.assert_allclose([top, bottom], [(0, 0, 255), (255, 0, 0)], atol=4)
 
 
 def test_what_is_refused_before_any_work(three, tmp_path, monkeypatch):

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`nrfgs doctor`: what is missing is named with its fix, and the status says whether training works."""
+
+from importlib.metadata import PackageNotFoundError
+from unittest.mock import Mock
+
+import pytest
+import torch
+
+import nrfgs_ns.rasterizer
+from nrfgs_ns import doctor
+from nrfgs_ns.densification import statistics
+from nrfgs_ns.image import metrics, ssim
+from nrfgs_ns.kernels.trial import Gate
+from nrfgs_ns.training import optimizers
+
+DECLARED = {
+    "torch>=2.6": "2.15.0+cpu",
+    "gsplat>=1.4,!=1.5.0": "1.4.0",
+    "pycolmap>=4.2": "4.2.1",
+    "winonly>=1; sys_platform == 'win32'": None,
+    "pillow-heif>=1.0; extra == 'heic'": "1.8.1",
+    "flip-evaluator>=1.6; extra == 'flip'": "1.7",
+    "pytest>=8; extra == 'dev'": None,
+}
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def installed(monkeypatch) -> dict[str, str | None]:
+    """Versions of declared packages, None where missing; to be changed. Imports and the machine are not looked at."""
+    versions = {doctor.Requirement(text).name: found for text, found in DECLARED.items()}
+
+    def version(name: str) -> str:
+        if versions.get(name, "0.2.0") is None:
+            raise PackageNotFoundError(name)
+        return versions.get(name, "0.2.0")
+
+    monkeypatch.setattr(doctor, "requires", lambda _: list(DECLARED))
+    monkeypatch.setattr(doctor, "version", version)
+    monkeypatch.setattr(doctor, "imports", Mock(return_value=[]))
+    monkeypatch.setattr(doctor, "machine", Mock(return_value=[]))
+    return versions
+
+
+def faults() -> dict[str, doctor.Finding]:
+    return {finding.name: finding for finding in doctor.packages() if finding.fix}
+
+
+def test_nothing_is_wrong_where_all_is_there(installed, capsys):
+    assert faults() == {}
+    doctor.Doctor().main()
+    printed = capsys.readouterr().out.splitlines()
+    assert {"nrfgs-ns: 0.2.0", "torch: 2.15.0+cpu", "gsplat: 1.4.0", "pillow-heif: 1.8.1"} <= set(printed)
+    assert not {"winonly", "pytest"} & {line.split(":")[0] for line in printed}, "not for this platform; for developers"
+    assert doctor.imports.called and doctor.machine.called
+
+
+@pytest.mark.parametrize("name", ["pycolmap", "pillow-heif", "flip-evaluator"])
+def test_training_works_without(name, installed, capsys):
+    installed[name] = None
+    doctor.Doctor().main()
+    assert list(faults()) == [name] and f"pip install '{name}>=" in capsys.readouterr().out
+    assert doctor.machine.called
+
+
+@pytest.mark.parametrize(
+    ("name", "found"), [("torch", None), ("torch", "2.5.1"), ("gsplat", None), ("gsplat", "1.5.0")]
+)
+def test_training_does_not_work_without(name, found, installed, capsys):
+    installed[name] = found
+    with pytest.raises(SystemExit) as stop:
+        doctor.Doctor().main()
+    assert stop.value.code not in (None, 0)
+    assert list(faults()) == [name] and f"pip install '{name}" in capsys.readouterr().out
+    assert not doctor.imports.called and not doctor.machine.called, "they import it"
+
+
+def test_what_cannot_be_imported_is_told(monkeypatch):
+    assert not doctor.imports()[0].broken
+    monkeypatch.setattr(doctor.importlib, "import_module", Mock(side_effect=OSError("libGL.so.1: cannot open")))
+    (finding,) = doctor.imports()
+    assert finding.broken and finding.fix and "libGL.so.1" in finding.state
+
+
+@pytest.mark.parametrize(("cuda", "fix"), [("13.2", "driver"), (None, "PyTorch for CUDA")])
+@pytest.mark.parametrize("advice", [None, "put it there"])
+def test_without_a_gpu_it_says_what_that_means(monkeypatch, cuda, fix, advice):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.version, "cuda", cuda)
+    monkeypatch.setattr(metrics, "lpips_advice", lambda: advice)
+    findings = {finding.name: finding for finding in doctor.machine()}
+    assert findings.keys() == {"LPIPS", "GPU"} and not any(finding.broken for finding in findings.values())
+    assert fix in findings["GPU"].fix and "CPU" in findings["GPU"].fix
+    assert findings["LPIPS"].fix == (advice or "")
+
+
+def test_a_gpu_is_named_with_its_memory(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "H100")
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (12e9, 80e9))
+    monkeypatch.setattr(doctor, "kernels", lambda device: [doctor.Finding("kernels", str(device))])
+    gpu, kernels = [finding for finding in doctor.machine() if finding.name != "LPIPS"]
+    assert all(part in gpu.state for part in ("H100", "12.0", "80.0")) and not gpu.fix and kernels.state == "cuda:0"
+
+
+def test_kernels_that_fail_are_told_apart(monkeypatch):
+    """gsplat's are needed; for Triton's there is PyTorch, and the reason is that of the trial."""
+    monkeypatch.setattr(nrfgs_ns.rasterizer, "load_kernels", lambda _: None)
+    for owner, name in ((ssim, "kernels_run_on"), (statistics, "try_kernel"), (optimizers, "try_kernel")):
+        monkeypatch.setattr(owner, name, lambda _: True)
+    monkeypatch.setattr("nrfgs_ns.appearance.nrf.NeuralResidualField.try_kernels", lambda *_: None)
+    assert [(finding.fix, finding.broken) for finding in doctor.kernels(CPU)] == [("", False)] * 2
+    trial = Mock(side_effect=OSError("no compiler"))
+    monkeypatch.setattr(ssim, "kernels_run_on", lambda device: Gate("SSIM").opens(device, device, trial))
+    gsplat, triton = doctor.kernels(CPU)
+    assert not gsplat.fix and not triton.broken and "SSIM" in triton.fix and "no compiler" in triton.fix
+    monkeypatch.setattr(nrfgs_ns.rasterizer, "load_kernels", Mock(side_effect=ImportError("no nvcc")))
+    gsplat, _ = doctor.kernels(CPU)
+    assert gsplat.broken and "no nvcc" in gsplat.state and "nvcc" in gsplat.fix
+
+
+@pytest.mark.gpu
+def test_all_kernels_run_on_this_gpu():
+    assert [finding.fix for finding in doctor.kernels(torch.device("cuda"))] == ["", ""]
