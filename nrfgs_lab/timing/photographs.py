@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """How long a training takes to read many or large photographs before its first step, and how much memory.
 
-    python -m nrfgs_lab.timing.photographs --out photographs.json
+    python -m nrfgs_lab.timing.photographs --out photographs.json [--data CAPTURE ...]
 
-Photographs are made for it: JPEGs of a gradient under noise, from a ring of cameras, and points. Each capture is read
-in a process of its own, the files in the system's cache. `own_bytes` is what the process had for itself at most: the
-system takes pages of mapped files back when it needs them, and they do not count.
+Without --data photographs are made for it: JPEGs of a gradient under noise, from a ring of cameras, and points. Each
+capture is read in a process of its own, the files in the system's cache. `own_bytes` is what the process had for itself
+at most: the system takes pages of mapped files back when it needs them, and they do not count.
 """
 
 import json
@@ -96,6 +96,8 @@ def read(folder: str, out: str, options: str) -> None:
     data = trainer.pipeline.datamanager
     images = [*data.cached_train, *data.cached_eval]
     record = {"size": list(images[0]["image"].shape[1::-1]), "kept_in": data._place, "seconds": seconds}
+    own = data.train_dataparser_outputs.metadata.get("points3D_xyz", ())
+    record |= {"views": len(data.train_dataset), "points": len(own), "splats": trainer.pipeline.model.num_points}
     record |= {"cpu_seconds": process_time() - start, "own_bytes": peak[0] - before}
     print(json.dumps(record | {"decoded_bytes": sum(image["image"].nbytes for image in images)}))
 
@@ -106,27 +108,32 @@ def own_bytes() -> int:
     return next(1024 * int(line.split()[1]) for line in lines if line.startswith("RssAnon:"))
 
 
+def reading(folder: Path, options: str) -> dict[str, Any]:
+    """The record of one capture."""
+    with TemporaryDirectory() as work:
+        code = "import sys; from nrfgs_lab.timing.photographs import read; read(*sys.argv[1:])"
+        command = [sys.executable, "-c", code, str(folder), f"{work}/out", options]
+        environment = {**os.environ, "XDG_CACHE_HOME": f"{work}/cache"}
+        said = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True).stdout
+    return {"machine": machine(), **json.loads(said.splitlines()[-1])}
+
+
 @dataclass
 class Photographs:
     """Measure the reading of captures."""
 
     out: Path  # JSON file for the records
-    captures: tuple[str, ...] = tuple(CAPTURES)  # which, one after the other
+    captures: tuple[str, ...] = tuple(CAPTURES)  # which of those that are made
+    data: tuple[Path, ...] = ()  # captures that are there, instead
 
     def main(self) -> None:
-        records = {}
-        for name in self.captures:
+        records = {folder.name: reading(folder, "") for folder in self.data}
+        for name in () if self.data else self.captures:
             *shape, options = CAPTURES[name]
             with TemporaryDirectory() as folder:
                 make(Path(folder, "capture"), *shape)
-                words = [f"{folder}/capture", f"{folder}/out", options]
-                code = "import sys; from nrfgs_lab.timing.photographs import read; read(*sys.argv[1:])"
-                environment = {**os.environ, "XDG_CACHE_HOME": f"{folder}/cache"}
-                command = [sys.executable, "-c", code, *words]
-                said = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True).stdout
-            records[name] = {"machine": machine(), **json.loads(said.splitlines()[-1])}
-            print(name, records[name], flush=True)
-        write_whole(self.out, json.dumps({"study": "large-photographs", "records": records}, indent=1) + "\n")
+                records[name] = reading(Path(folder, "capture"), options)
+        write_whole(self.out, json.dumps({"study": self.out.stem, "records": records}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

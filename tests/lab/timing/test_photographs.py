@@ -3,15 +3,14 @@
 
 import json
 
-from nrfgs_lab.timing import photographs
-from nrfgs_lab.timing.photographs import Photographs
+from nrfgs_lab.timing.photographs import Photographs, make
 
 
-def test_a_capture_is_made_and_read(tmp_path, monkeypatch):
-    options = "--pipeline.datamanager.image-memory 0 --pipeline.model.dense-start off"
-    monkeypatch.setitem(photographs.CAPTURES, "small", (10, 60, 40, options))
-    Photographs(tmp_path / "out.json", ("small",)).main()
+def test_a_capture_is_made_and_read(tmp_path):
+    make(tmp_path / "small", 10, 60, 40)
+    Photographs(tmp_path / "out.json", data=(tmp_path / "small",)).main()
     (record,) = json.loads((tmp_path / "out.json").read_text())["records"].values()
-    assert record["size"] == [60, 40] and record["kept_in"] == "files"
+    assert record["size"] == [60, 40] and record["views"] == 9
     assert record["decoded_bytes"] == 10 * 60 * 40 * 3
+    assert 0 < record["points"] <= record["splats"]
     assert {"all", "images"} <= record["seconds"].keys() and record["own_bytes"] > 0
