@@ -130,9 +130,7 @@ class NrfgsTrainer(Trainer):
         if "optimizers" not in content:
             raise InputError(f"{path} is of a compact file, which no training goes on from. Use its training's own.")
         if "training" not in content:
-            raise InputError(
-                f"{path} was written by another method, such as splatfacto. Train anew, without --load-dir."
-            )
+            raise InputError(f"{path} is of another method, such as splatfacto. Train anew, without --load-dir.")
         self._start_step = content["step"] + 1
         training = content["training"]
         check_scene(training["scene"], self._scene(), self.pipeline.datamanager.get_datapath())
