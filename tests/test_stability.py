@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The catalogue of extremes: its checks hold, and its tests exist. Hard trainings must end with finite numbers.
-docs/stability.md."""
+docs/troubleshooting.md."""
 
 import ast
 import json

@@ -4,12 +4,11 @@
 python -m nrfgs_lab.pages.files        # writes docs/images/compact-trade.png
 """
 
-import re
 from statistics import fmean
 from typing import Any
 
 from nrfgs_lab.pages.few_views import SHRUNK, runs_of
-from nrfgs_lab.pages.runs import ROOT, records, signed, table
+from nrfgs_lab.pages.runs import ROOT, records, table
 from nrfgs_ns.files import whole
 
 CAPTURES = "bonsai", "goldcape", "fox"
@@ -25,17 +24,6 @@ def reports(scene: str) -> dict[str, Report]:
 def tuned(scene: str) -> dict[str, Report]:
     """The fine-tuned files of a scene, by rate."""
     return {name: one for name, one in reports(scene).items() if name.startswith("rate")}
-
-
-def at(scene: str, what: str, value: str) -> str:
-    """Decibels lost at a size in MB, or MB at a loss in dB, on straight lines between fine-tunes."""
-    import numpy as np
-
-    files = tuned(scene).values()
-    size, loss = [one["bytes"] / 1e6 for one in files], [one["loss_db"] for one in files]
-    if what == "loss":
-        return f"{np.interp(-float(value), [-x for x in size], loss):.2f}"
-    return f"{np.interp(float(value), loss, size):.1f}"
 
 
 def added(scene: str) -> str:
@@ -96,21 +84,9 @@ def losses() -> str:
     )
 
 
-def settings() -> str:
-    """DB by which files differ from models on held-out views, after 0, the fewest and the most steps tried."""
-    scenes: dict[str, dict[int, str]] = {}
-    for name, one in records("compact").items():
-        if match := re.fullmatch(r"held-out-(\w+)-ply-STEPS=(\d+)", name):
-            scenes.setdefault(match[1], {})[int(match[2])] = signed(-one["loss_db"], 2)
-    return "; ".join(
-        f"{scene} " + ", ".join(f"{one[steps]} ({steps:,})" for steps in [*sorted(one)[:2], max(one)])
-        for scene, one in scenes.items()
-    )
-
-
 BLOCKS = {
-    **{f"compact_format.{block.__name__}": block for block in (at, added)},
-    **{f"export.{block.__name__}": block for block in (losses, settings)},
+    "compact_format.added": added,
+    "export.losses": losses,
     "export.worst": lambda: f"{max(one['loss_db'] for one in plies().values()):.1f}",
 }
 

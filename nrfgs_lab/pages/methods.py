@@ -23,12 +23,11 @@ BASE = "3DGS"
 METHODS = "VDGS", "GSNB", "SG", "NRF-GS", "ours"
 OF_THE_PAPER = {"VDGS": (0.49, 1.286), "GSNB": (0.96, 1.175), "NRF-GS": (1.01, 0.456)}
 """The paper's gains on bonsai, in dB, and splats in multiples of 3DGS's."""
-BUDGETS = "mcmc@150000", "mcmc@75000"
 
 
-def half(scene: str, run: str, rule: str = ORIGINAL) -> Trainings:
-    """A run of the plan `methods`, or of `budgets`."""
-    return trainings("methods", scene, run, rule)
+def half(scene: str, run: str) -> Trainings:
+    """A run of the plan `methods` under 3DGS's rules."""
+    return trainings("methods", scene, run)
 
 
 def gain(ours: Trainings, theirs: Trainings, metric: str) -> float:
@@ -47,36 +46,24 @@ def every() -> str:
     return grid(["", "paper", "protocol", *VIEWS, "splats", "ahead"], body)
 
 
-def equal() -> str:
-    """3DGS's PSNR with 150,000 and 75,000 splats, and the others' gains."""
-    levels = zip(*([level.partition("/")[0] for level in _levels(rule)] for rule in BUDGETS), strict=True)
-    body = [[BASE, *map(", ".join, levels), ""]]
-    for run in METHODS:
-        gains = zip(*(_gains(run, rule, ssim=False) for rule in BUDGETS), strict=True)
-        body.append([run, *map(", ".join, gains), ", ".join(_ahead(run, rule) for rule in BUDGETS)])
-    return grid(["150,000, 75,000 splats", *VIEWS, "ahead"], body)
-
-
 def seeds(run: str, scene: str) -> str:
     """Decibels between a run's best and worst seed under 3DGS's rules."""
     values = [one["psnr"] for one in half(scene, run)]
     return f"{max(values) - min(values):.1f}"
 
 
-def _levels(rule: str = ORIGINAL) -> list[str]:
-    every = [half(scene, BASE, rule) for scene in VIEWS]
+def _levels() -> list[str]:
+    every = [half(scene, BASE) for scene in VIEWS]
     return [f"{mean(runs, 'psnr'):.2f}/{mean(runs, 'ssim'):.3f}" for runs in every]
 
 
-def _gains(run: str, rule: str = ORIGINAL, ssim: bool = True) -> list[str]:
+def _gains(run: str) -> list[str]:
     """A cell for each capture, bold if it is the capture's largest gain in dB."""
     cells = []
     for scene in VIEWS:
-        base = half(scene, BASE, rule)
-        gains = {one: gain(half(scene, one, rule), base, "psnr") for one in METHODS}
-        cell = signed(gains[run], 2)
-        if ssim:
-            cell += f"/{signed(1000 * gain(half(scene, run, rule), base, 'ssim'), 0)}"
+        base = half(scene, BASE)
+        gains = {one: gain(half(scene, one), base, "psnr") for one in METHODS}
+        cell = f"{signed(gains[run], 2)}/{signed(1000 * gain(half(scene, run), base, 'ssim'), 0)}"
         cells.append(f"**{cell}**" if gains[run] == max(gains.values()) > 0 else cell)
     return cells
 
@@ -92,9 +79,9 @@ def _protocol(run: str) -> str:
     return f"{signed(mean_of(ours, 'PSNR') - mean_of(base, 'PSNR'), 2)} ({share:.2f})"
 
 
-def _ahead(run: str, rule: str = ORIGINAL) -> str:
+def _ahead(run: str) -> str:
     """On how many captures a run is above 3DGS: in PSNR, in SSIM, in PSNR in the median test view."""
-    pairs = [(half(scene, run, rule), half(scene, BASE, rule)) for scene in VIEWS]
+    pairs = [(half(scene, run), half(scene, BASE)) for scene in VIEWS]
     measured = [(gain(*pair, "psnr"), gain(*pair, "ssim"), median(view_gains(*pair))) for pair in pairs]
     counts = [sum(round(gain, 3) > 0 for gain in gains) for gains in zip(*measured, strict=True)]
     return "/".join(map(str, counts))
@@ -187,7 +174,7 @@ def worth(change: str) -> str:
     for scene in SCENES:
         changed, plain = (trainings("deviations", scene, run) for run in (change, change.partition("_")[0]))
         gain = signed(median(view_gains(changed, plain)), 2)
-        cells.append(f"`{scene}` {gain} (x{mean(changed, 'splats') / mean(plain, 'splats'):.2f})")
+        cells.append(f"{gain} (x{mean(changed, 'splats') / mean(plain, 'splats'):.2f})")
     return ", ".join(cells)
 
 
@@ -227,7 +214,7 @@ def resets() -> str:
 BLOCKS = {
     **{
         f"comparison.{block.__name__}": block
-        for block in (every, equal, seeds, gains, stored_opacity, parts, over_gsnb, chosen)
+        for block in (every, seeds, gains, stored_opacity, parts, over_gsnb, chosen)
     },
     **{f"deviations.{block.__name__}": block for block in (worth, noise, start, rules, resets)},
 }

@@ -6,6 +6,7 @@ python -m nrfgs_lab.pages.options            # writes docs/options.md
 
 import dataclasses
 import re
+from collections import defaultdict
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -27,10 +28,10 @@ APPEARANCE = "pipeline.model.appearance."
 
 INTRODUCTION = """# Options
 
-What this package adds to nerfstudio's options, or sets in its own way; `ns-train nrfgs --help` lists all. Written by
-`python -m nrfgs_lab.pages.options`. Defaults are `nrfgs`'s. The other
-methods (`nrfgs-sh`, ...) have `view-noise`, `few-views`, `shrinkage`, `dense-start` and `near-plane` off, splatfacto's
-densification, and 30,000 steps without averaging; each can be switched on. Cameras lie within [-1, 1] scene units.
+**What this package adds to nerfstudio's options, or sets in its own way; `ns-train nrfgs --help` lists all.** Defaults
+are `nrfgs`'s. The other methods (`nrfgs-sh`, ...) have `view-noise`, `few-views`, `shrinkage`, `dense-start` and
+`near-plane` off, splatfacto's densification, and 30,000 steps without averaging; each can be switched on. Cameras lie
+within [-1, 1] scene units. `python -m nrfgs_lab.pages.options` writes this page.
 """
 SPLATFACTOS = {field.name for field in dataclasses.fields(SplatfactoModelConfig)}
 """Options of splatfacto's model, not explained here."""
@@ -145,15 +146,21 @@ def page() -> str:
 
 
 def strategies() -> str:
-    """Options of each densification strategy."""
-    parts = [
-        "### Strategies\n\nOptions of a strategy follow its name: `--pipeline.model.densification "
-        "mcmc,budget=150000,refine_every=50`. [What they do](bench.md#densification-strategies).\n"
-    ]
+    """Options of the densification strategies; a row for all that explain one alike."""
+    rows: dict[tuple[str, str], dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
     for name, config in STRATEGIES.items():
-        options = [option._replace(flag=option.flag.replace("-", "_")) for option in own_options(config())]
-        parts.append(table(options).replace("| | default | |", f"| `{name}` | default | |"))
-    return "\n".join(parts)
+        for option in own_options(config()):
+            rows[option.flag.replace("-", "_"), option.text][_shown(option.default)].append(f"`{name}`")
+    lines = ["| | default of | |", "|---|---|---|"]
+    for (flag, text), defaults in rows.items():
+        cell = "; ".join(f"{', '.join(names)}: {default}" for default, names in defaults.items())
+        lines.append(f"| `{flag}` | {cell} | {linked(text)} |")
+    return (
+        "### Strategies\n\nOptions of a strategy follow its name: `--pipeline.model.densification "
+        "mcmc,budget=150000,refine_every=50`. [What they do](bench.md#densification-strategies).\n\n"
+        + "\n".join(lines)
+        + "\n"
+    )
 
 
 def rates(method: MethodSpecification) -> str:

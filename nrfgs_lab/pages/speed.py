@@ -4,7 +4,7 @@
 from collections import defaultdict
 from datetime import datetime, timedelta
 from pathlib import Path
-from statistics import fmean, median
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -39,30 +39,6 @@ def _ratios(column: str, run: str, base: str) -> list[float]:
         for other, two in theirs.records.items()
         if abs(began(one) - began(two)) < SITTING
     ]
-
-
-TRAININGS = "splatfacto", "splatfacto-10k", "splatfacto-big-10k", "nrfgs-sh", "nrfgs", "nrfgs-fast", "nrfgs-best"
-
-
-def _share(run: str) -> str:
-    shares = _ratios("time s", run, "splatfacto")
-    if shares:
-        return f"{median(shares):.2f}"
-    return f"{fmean(values('time s', run)) / fmean(values('time s', 'splatfacto')):.2f}*"
-
-
-def trainings() -> str:
-    """What whole trainings of bonsai cost: each run's seconds, means of the rest."""
-    return table(
-        "bonsai | seconds | of splatfacto's | PSNR | splats | peak MB | frames/s, own size/1080p",
-        {f"`{run}`": run for run in TRAININGS},
-        lambda run: ", ".join(f"{value:.1f}" for value in values("time s", run)),
-        _share,
-        lambda run: f"{mean_of(row_of(run), 'PSNR'):.2f}",
-        lambda run: f"{mean_of(row_of(run), 'splats') / 1000:.0f}k",
-        lambda run: f"{mean_of(row_of(run), 'peak MB'):.0f}",
-        lambda run: "/".join(f"{mean_of(row_of(run), name):.0f}" for name in ("FPS", "FPS 1080p")),
-    )
 
 
 def spread(*runs: str) -> str:
@@ -135,15 +111,6 @@ def _scale(column: str) -> dict[tuple[int, float], dict[str, list[float]]]:
     return dict(sorted(places.items()))
 
 
-def scale(column: str, factor: str, form: str) -> str:
-    """A quantity of training steps after growth, medians of repeats."""
-    body = []
-    for (count, pixels), cells in _scale(column).items():
-        values = (format(median(cells[one]) * float(factor), form) for one in RENDERERS)
-        body.append([f"{count / 1e6:g}M, {pixels:g} MP", *values])
-    return grid(["splats, image", *RENDERERS.values()], body)
-
-
 def scale_frames() -> str:
     """Frames per second at two sizes, medians of repeats."""
     large, body = _scale("4K"), []
@@ -173,8 +140,7 @@ def scale_spread() -> str:
 
 
 BLOCKS = {
-    **{f"speed.{block.__name__}": block for block in (scale, scale_fit, scale_frames, scale_ratio, scale_spread)},
-    **{f"speed.{block.__name__}": block for block in (trainings, spread)},
+    **{f"speed.{block.__name__}": block for block in (scale_fit, scale_frames, scale_ratio, scale_spread, spread)},
     "speed.ratio": lambda column, run, base: f"{median(_ratios(column, run, base)):.2f}",
     "trade_off.presets": presets,
     "trade_off.gain": gain,

@@ -34,10 +34,8 @@ FORMS: dict[str, Callable[[Any], str]] = {
     "signed": lambda number: signed(number, 2),
     "MB": lambda number: f"{number / 1e6:.{1 if number > 1e7 else 2}f}",
     "size": lambda number: f"{number / 1000:,.0f} KB" if number < 1e6 else f"{number / 1e6:.1f} MB",
-    "mean": lambda row: f"{row['mean']:.2f}",
-    "±": lambda row: f"{row['mean']:.2f}" + (f"±{row['deviation']:.2f}" if row["deviation"] is not None else ""),
 }
-"""Forms beside Python's. The last two are of a mean with a deviation."""
+"""Forms beside Python's."""
 
 
 def pages():

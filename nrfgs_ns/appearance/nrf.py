@@ -68,7 +68,7 @@ class NrfConfig(AppearanceHeadConfig):
     output_init: Literal["zero", "default"] = "zero"
     """start of the output layers. zero: no residual. default: torch's, as in the paper, followed by the warm-up"""
     opacity_bound: OpacityBound | None = None
-    """how base + residual stays in [0, 1] (docs/opacity.md). straight-through: clamped, but the gradient ignores the
+    """how base + residual stays in [0, 1] (docs/deviations.md). straight-through: clamped, but the gradient ignores the
     clamp. logit: the residual is added to the logit. None: logit for mcmc, otherwise straight-through"""
     implementation: Literal["auto", "torch", "fused"] = "auto"
     """auto: fused Triton kernels on CUDA where they can run, PyTorch elsewhere. fused: an error instead of PyTorch"""

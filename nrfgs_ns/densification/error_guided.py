@@ -69,7 +69,7 @@ class ErrorGuided(DensificationConfig):
 
     name: ClassVar[str] = "error-guided"
     opacity_seen: OpacitySeen = "peak"
-    """opacity by which splats are dead (docs/opacity.md). base: stored. peak: largest shown in two windows"""
+    """opacity by which splats are dead (docs/deviations.md). base: stored. peak: largest shown in two windows"""
     refine_every: int = 200
     """steps between refinements; the views of these are a window"""
     threshold: float = 0.0025

@@ -37,8 +37,8 @@ class Mcmc(DensificationConfig):
     copies_splats: ClassVar[bool] = True
     regularises: ClassVar[bool] = True
     opacity_seen: OpacitySeen = "peak"
-    """opacity by which splats are moved (docs/opacity.md). base: stored. peak: largest shown since the last
-    refinement"""
+    """opacity by which splats are pruned or moved (docs/deviations.md). base: stored. peak: largest shown since the
+    last refinement"""
     budget: int = 1_000_000
     """number of splats to grow to and to keep"""
     stop_at: int = 25_000

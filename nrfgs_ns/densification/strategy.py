@@ -78,8 +78,8 @@ class DensificationConfig(ABC):
     shrinkage: ClassVar[float] = 0.0
     """weight that it adds to the model's `shrinkage`, in percent, however many training views there are"""
     opacity_seen: OpacitySeen = "base"
-    """opacity by which splats are pruned or moved (docs/opacity.md). base: stored. peak: largest shown since the last
-    refinement"""
+    """opacity by which splats are pruned or moved (docs/deviations.md). base: stored. peak: largest shown since the
+    last refinement"""
     warmup_length: int = 500
     """step after which refinement begins"""
     refine_every: int = 100

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The outcome of one hostile input.
 
-The promise (docs/stability.md): an input that cannot be used is refused with one clear sentence, before anything is
-written, with a bounded number of calls (counted, so that the outcome does not depend on the machine) and less than a
+The promise (docs/troubleshooting.md): an input that cannot be used is refused with one clear sentence, before anything
+is written, with a bounded number of calls (counted, so that the outcome does not depend on the machine) and less than a
 gigabyte of memory. Attempts are made in a child process, which may be killed.
 """
 
