@@ -17,7 +17,6 @@ from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from nrfgs_ns import method_config
-from nrfgs_ns.cli import commands, summary
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.densification import STRATEGIES, DensificationConfig
 
@@ -137,11 +136,8 @@ def page() -> str:
         "## Methods\n",
         "| `ns-train` | |\n|---|---|",
         *(f"| `{one.config.method_name}` | {linked(one.description)} |" for one in others),
-        "\n`ns-train METHOD --help` explains the options of its head.\n",
-        "## Commands\n\n| | |\n|---|---|",
+        "\n`ns-train METHOD --help` explains the options of its head, `nrfgs --help` lists the other commands.",
     ]
-    for name, entry_point in commands().items():
-        parts.append(f"| `nrfgs {name}` | {summary(entry_point)} |")
     return "\n".join(parts) + "\n"
 
 
@@ -153,7 +149,10 @@ def strategies() -> str:
             rows[option.flag.replace("-", "_"), option.text][_shown(option.default)].append(f"`{name}`")
     lines = ["| | default of | |", "|---|---|---|"]
     for (flag, text), defaults in rows.items():
-        cell = "; ".join(f"{', '.join(names)}: {default}" for default, names in defaults.items())
+        cells = [
+            f"{', '.join(names)}: {default}" for default, names in defaults.items() if len(names) < len(STRATEGIES)
+        ]
+        cell = "; ".join(cells) or f"all: {next(iter(defaults))}"
         lines.append(f"| `{flag}` | {cell} | {linked(text)} |")
     return (
         "### Strategies\n\nOptions of a strategy follow its name: `--pipeline.model.densification "
