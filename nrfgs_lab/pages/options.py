@@ -36,8 +36,8 @@ SPLATFACTOS = {field.name for field in dataclasses.fields(SplatfactoModelConfig)
 """Options of splatfacto's model, not explained here."""
 LEFT_OUT = (
     *("logging.local-writer.enable", "pipeline.datamanager.cache-images-type", "pipeline.sharding.rebalance-at"),
-    *("pipeline.model.appearance.distance-eps", "load-3D-points"),
-    *("viewer.websocket-host", "pipeline.datamanager.image-memory", "pipeline.compact"),
+    *(APPEARANCE + name for name in ("distance-eps", "implementation", "precision")),
+    *("load-3D-points", "viewer.websocket-host", "pipeline.datamanager.image-memory", "pipeline.compact"),
 )
 """Options that few need, or that another page explains: `--help` has them."""
 HOST = "`--data`, `--vis`, `--load-dir`, `--output-dir` and `--machine.seed` are nerfstudio's.\n"

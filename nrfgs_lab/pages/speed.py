@@ -53,7 +53,6 @@ PRESETS = {
     "splatfacto": "splatfacto",
     "splatfacto-10k": "the same, 10,000 steps",
     "splatfacto-big": "splatfacto-big",
-    "splatfacto-big-10k": "the same, 10,000 steps",
     **{run: f"`{run}`" for run in ("nrfgs-sh", "nrfgs-fast", "nrfgs", "nrfgs-best")},
 }
 
