@@ -4,7 +4,9 @@
     python -m nrfgs_lab.pages.web PAGE.html RECORD.json --browser "chromium --headless=new ..." --config CONFIG
 
 Any browser that takes an address will do. It opens a page from a local server that holds PAGE in a frame, measures, and
-sends back numbers and three pictures. Without --config only Python's own library is needed.
+sends back numbers and three pictures. Without --config only Python's own library is needed. On an H200 it was
+"chromium-headless-shell --no-sandbox --enable-gpu --ignore-gpu-blocklist --use-gl=angle --use-angle=gl-egl", or
+"... vulkan --enable-features=Vulkan --disable-vulkan-surface"; Firefox without a screen: "xvfb-run -a firefox-esr".
 """
 
 import argparse
