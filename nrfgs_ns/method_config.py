@@ -3,7 +3,8 @@
 
 The methods for comparison differ from splatfacto in the appearance head alone: learning rates, schedules, densification
 and steps are splatfacto's, to the number. `nrfgs` also suits the training to the capture: steps, growth, start, near
-plane, and how far the views are trusted (docs/captures.md). Its two presets are ends of the trade in docs/speed.md.
+plane, and how far the views are trusted (docs/captures.md). Its two presets are ends of the trade in docs/speed.md, and
+`nrfgs-harmonics` suits the training of harmonics alike.
 """
 
 from copy import deepcopy
@@ -36,8 +37,13 @@ with_methods()
 HALF_A_SPACING = 0.5
 """Noise on where the field is asked from, in distances between neighbouring training cameras (docs/captures.md)."""
 
-SHRINKAGE = 3.0
-"""Weight of mean opacity and mean size in the loss, in percent, halved with every 12 training views."""
+SUITED = {
+    "densification": ErrorGuided(),
+    "dense_start": "auto",
+    "near_plane": "auto",
+    "shrinkage": 3.0,  # halved with every 12 training views
+}
+"""The model's options that suit a training to its capture, whatever the head."""
 
 
 def adam(lr: float, lr_final: float | None = None, **schedule: Any) -> dict[str, Any]:
@@ -92,14 +98,7 @@ nrfgs = preset(
     "nrfgs",
     method("nrfgs", NrfConfig(), "", latents=adam(0.0025), field=adam(5e-3, lr_final=5e-4)),
     "Gaussian splatting with a neural residual field for view-dependent colour and opacity.",
-    model={
-        "densification": ErrorGuided(),
-        "dense_start": "auto",
-        "near_plane": "auto",
-        "view_noise": HALF_A_SPACING,
-        "few_views": "auto",
-        "shrinkage": SHRINKAGE,
-    },
+    model={**SUITED, "view_noise": HALF_A_SPACING, "few_views": "auto"},
     max_num_iterations=0,
 )
 
@@ -127,6 +126,14 @@ nrfgs_sh = method(
     ShConfig(),
     "For comparison: spherical harmonics, 3DGS as in splatfacto.",
     features_rest=adam(0.0025 / 20),
+)
+
+nrfgs_harmonics = preset(
+    "nrfgs-harmonics",
+    nrfgs_sh,
+    "nrfgs with spherical harmonics instead of the field: for few photographs (docs/captures.md).",
+    model=SUITED,
+    max_num_iterations=0,
 )
 
 nrfgs_vdgs = method(

@@ -19,7 +19,16 @@ from nrfgs_ns.appearance.sg import SphericalGaussians
 from nrfgs_ns.appearance.sh import SphericalHarmonics
 from nrfgs_ns.appearance.vdgs import ViewDirectionFactors
 from nrfgs_ns.densification import Splatfacto
-from nrfgs_ns.method_config import nrfgs, nrfgs_best, nrfgs_fast, nrfgs_gsnb, nrfgs_sg, nrfgs_sh, nrfgs_vdgs
+from nrfgs_ns.method_config import (
+    nrfgs,
+    nrfgs_best,
+    nrfgs_fast,
+    nrfgs_gsnb,
+    nrfgs_harmonics,
+    nrfgs_sg,
+    nrfgs_sh,
+    nrfgs_vdgs,
+)
 from nrfgs_ns.training.identity import leaves
 
 METHODS = {
@@ -30,7 +39,7 @@ METHODS = {
     "nrfgs-sg": (nrfgs_sg, SphericalGaussians, {"sg_axes", "sg_sharpness", "sg_colors"}),
 }
 """Of each method: its specification, its head, and the groups of parameters that its head adds."""
-PRESETS = {"nrfgs-fast": nrfgs_fast, "nrfgs-best": nrfgs_best}
+PRESETS = {"nrfgs-fast": nrfgs_fast, "nrfgs-best": nrfgs_best, "nrfgs-harmonics": nrfgs_harmonics}
 
 
 @pytest.mark.parametrize("name", [*METHODS, *PRESETS])
@@ -118,6 +127,16 @@ def test_a_preset_differs_in_what_it_says_and_shares_nothing(name, differs):
     changed = {key: ours[key] for key in ours if str(ours[key]) != str(base[key])}
     assert changed == {"method_name": name, **differs}
     assert PRESETS[name].config.pipeline.model.appearance is not nrfgs.config.pipeline.model.appearance
+
+
+def test_harmonics_have_all_rules_that_are_not_the_fields():
+    ours, field, plain = (dict(leaves(method.config)) for method in (nrfgs_harmonics, nrfgs, nrfgs_sh))
+    rules = {f"pipeline.model.{name}" for name in ("densification", "dense_start", "near_plane", "shrinkage")}
+    rules |= {"max_num_iterations"}
+    assert {key for key in ours if str(ours[key]) != str(plain[key])} == {"method_name", *rules}
+    assert all(str(ours[key]) == str(field[key]) for key in rules)
+    noise = {"pipeline.model.view_noise", "pipeline.model.few_views"}
+    assert {key for key in ours if key in field and str(ours[key]) != str(field[key])} - {"method_name"} >= noise
 
 
 def test_nerfstudio_still_knows_who_asks_for_an_external_method(capsys):

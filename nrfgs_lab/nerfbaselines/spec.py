@@ -12,6 +12,11 @@ METHODS = {
     "nrfgs-fast": ("NrfgsFast", "NRF-GS fast", "NRF-GS in 10,000 steps, its schedules shortened to them."),
     "nrfgs-best": ("NrfgsBest", "NRF-GS best", "NRF-GS with more splats."),
     "nrfgs-sh": ("NrfgsSh", "NRF-GS host with SH", "The same host with spherical harmonics of degree 3, as in 3DGS."),
+    "nrfgs-harmonics": (
+        "NrfgsHarmonics",
+        "NRF-GS's rules with SH",
+        "NRF-GS with spherical harmonics instead of the field.",
+    ),
     "nrfgs-vdgs": ("NrfgsVdgs", "NRF-GS host with VDGS", "The same host; opacity depends on the view as in VDGS."),
     "nrfgs-gsnb": ("NrfgsGsnb", "NRF-GS host with GSNB", "The same host; directions have a learnt basis as in GSNB."),
     "nrfgs-sg": ("NrfgsSg", "NRF-GS host with SG", "The same host with three spherical Gaussians per splat."),

@@ -7,8 +7,18 @@ from types import SimpleNamespace
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
+from torch.nn.functional import avg_pool2d
 
-from nrfgs_ns.data.plane_sweep import KEPT, Views, dense_points, share_kept, small_views
+from nrfgs_ns.data.plane_sweep import (
+    KEPT,
+    WINDOW,
+    Views,
+    _mean_of_largest,
+    _window_mean,
+    dense_points,
+    share_kept,
+    small_views,
+)
 from nrfgs_ns.training.dense_start import start_with_dense_points
 
 SIZE, FOCAL, DISTANCE = 48, 60.0, 4.0
@@ -118,3 +128,16 @@ def test_a_training_starts_with_them_if_asked_to():
     for config in ({"dense_start": "off", "random_init": False}, {"dense_start": "auto", "random_init": True}):
         model.config = SimpleNamespace(**config)
         assert start_with_dense_points(model, datamanager) == [] and len(started) == 1
+
+
+def test_the_quick_means_are_torchs():
+    """To the bit: the points that a training starts from do not change."""
+    draw = torch.Generator().manual_seed(0)
+    images, rows = torch.rand(3, 2, 19, 23, generator=draw), torch.rand(6, 50, generator=draw)
+    window = images
+    for size in ((1, WINDOW), (WINDOW, 1)):
+        padding = size[0] // 2, size[1] // 2
+        window = avg_pool2d(window, size, stride=1, padding=padding, count_include_pad=False)
+    assert torch.equal(_window_mean(images), window)
+    for count in (1, 3, 6):
+        assert torch.equal(_mean_of_largest(rows, count), rows.topk(count, dim=0).values.mean(dim=0))
