@@ -20,12 +20,12 @@ from typing import Any
 
 import yaml
 
-from nrfgs_lab.pages import few_views, files, methods, others, speed
+from nrfgs_lab.pages import appendix, few_views, files, methods, others, speed
 from nrfgs_lab.pages.runs import ROOT, grid, records, signed
 
 OPENING = "<!-- table "
 BLOCK = re.compile(r"<!-- table (\w+\.\w+)(\([^\n]*?\))? -->(.*?)<!-- end -->", re.DOTALL)
-BLOCKS = few_views.BLOCKS | files.BLOCKS | methods.BLOCKS | others.BLOCKS | speed.BLOCKS
+BLOCKS = appendix.BLOCKS | few_views.BLOCKS | files.BLOCKS | methods.BLOCKS | others.BLOCKS | speed.BLOCKS
 SHEET = ROOT / "nrfgs_lab" / "pages" / "numbers.yaml"
 UNITS = {"k": 1e3, "M": 1e6, "G": 1e9}
 AGGREGATES: dict[str, Callable] = {"min": min, "max": max, "mean": fmean, "median": median, "sum": sum}
