@@ -20,7 +20,7 @@ def test_pictures_of_the_page_are_timed_on_the_way_of_the_others_cameras(tmp_pat
     pytest.importorskip("playwright.sync_api", reason="no playwright: pip install -e '.[browser]'")
     if browser.CHROMIUM is None:
         pytest.skip("no Chromium on the path")
-    viewers.write_scene(tmp_path, 3000, SIZE, 4)
+    viewers.write_scene(tmp_path, 12_000, SIZE, 4)  # fills more than a row of the order's texture
     record = viewers.measured(tmp_path, ("page", "base"), SIZE, 2)
     assert all(len(seconds) == 2 and min(seconds) > 0 for seconds in record["seconds"].values())
     images = record["images"]
