@@ -226,13 +226,7 @@ function frame(now) {
     rowsLeft = painter.rows;
   }
   if (rowsLeft > 0) {
-    const center = state.frozen ?? state.camera.eye;
-    const task = {
-      center,
-      camera: state.frozen ? null : seenBy(state.camera),
-      mode: state.show === "base" ? "full" : state.show,
-      gain: state.show === "base" ? 0 : state.gain,
-    };
+    const task = fieldTask();
     for (let left = Math.min(rowsLeft, moving ? Math.max(1, Math.round(share)) : painter.rows); left > 0; ) {
       const rows = Math.min(left, painter.rows - row);
       painter.evaluate(task, row, rows);
@@ -255,6 +249,16 @@ function frame(now) {
   const done = finished();
   if (done) for (const resolve of waiting.splice(0)) resolve();
   if (moving || journey || turning || rowsLeft > 0 || held.size > 0 || stale || (drawnFor && drawnFor.resolution !== 1)) wake();
+}
+
+// What the field is evaluated for, as the page is set.
+function fieldTask() {
+  return {
+    center: state.frozen ?? state.camera.eye,
+    camera: state.frozen ? null : seenBy(state.camera),
+    mode: state.show === "base" ? "full" : state.show,
+    gain: state.show === "base" ? 0 : state.gain,
+  };
 }
 
 function paint(resolution) {

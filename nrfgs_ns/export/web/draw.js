@@ -3,15 +3,18 @@
 // 1/255, each splat in the 16-pixel tiles that the square of three standard deviations meets. Projection as in
 // nrfgs_ns/rasterizer/torch_cpu/projection.py.
 
+// Splats in an instance: what draws instances one by one, as renderers without a GPU do, is slow with one splat in each.
+const BATCH = 1024;
+
 const SPLAT_VERTEX = `${HEAD}
 uniform sampler2D table;
-uniform usampler2D looks;
+uniform usampler2D looks, order;
+uniform int drawn;
 uniform mat4 view;       // world to camera: x right, y down, z forwards
 uniform vec4 lens;       // focal lengths and principal point, pixels
 uniform vec2 size;       // of the picture, pixels
 uniform float near;
 uniform bool antialiased;
-in uint splat;
 flat out vec4 look;      // colour, opacity
 flat out vec3 conic;
 flat out vec2 mean;      // pixels, from the top left
@@ -19,7 +22,9 @@ flat out vec4 tiles;     // left, top, right, bottom of the tiles that may be to
 
 void main() {
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // outside, until there is something to draw
-  int i = int(splat);
+  int k = gl_InstanceID * ${BATCH} + (gl_VertexID >> 2);
+  if (k >= drawn) return;
+  int i = int(texelFetch(order, ivec2(k % ${WIDTH}, k / ${WIDTH}), 0).r);
   ivec2 at = ${texel(TABLE_TEXELS)};
   look = uintBitsToFloat(texelFetch(looks, ivec2(i % ${PER_ROW(TABLE_TEXELS)}, i / ${PER_ROW(TABLE_TEXELS)}), 0));
   vec4 q = texelFetch(table, at + ivec2(1, 0), 0);
@@ -57,7 +62,7 @@ void main() {
   vec2 axis = xx >= yy ? vec2(longest - yy, xy) : vec2(xy, longest - xx);
   axis = spread > 0.0 ? normalize(axis) : vec2(1.0, 0.0);
   vec2 half_axes = sqrt(2.0 * log(255.0 * look.a) * vec2(longest, blurred / longest)) + 0.01;
-  vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
+  vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1 & 1) * 2.0 - 1.0;
   vec2 pixel = mean + corner.x * half_axes.x * axis + corner.y * half_axes.y * vec2(-axis.y, axis.x);
   gl_Position = vec4(2.0 * pixel / size - 1.0, 0.0, 1.0) * vec4(1.0, -1.0, 1.0, 1.0);
 }
@@ -119,7 +124,6 @@ class Painter {
       throw new Lacking(`This device's textures are too small for ${scene.count.toLocaleString()} splats.`);
     }
 
-    gl.bindVertexArray((this.none = gl.createVertexArray()));
     this.table = this._floats(scene.table, TABLE_TEXELS, scene.count);
     this.rows = this._height(scene.count, TABLE_TEXELS);
     this.looks = this._texture(gl.RGBA32UI, PER_ROW(TABLE_TEXELS), this.rows);
@@ -127,7 +131,7 @@ class Painter {
     this._buildField(scene);
     this._buildSplats();
     this.show = this._program(WHOLE_VERTEX, SHOW_FRAGMENT);
-    this.drawn = 0;  // instances whose order is known
+    this.drawn = 0;
     this.target = null;
     if (gl.getError() === gl.OUT_OF_MEMORY) throw new Lacking("This device's graphics memory is too small for the scene.");
   }
@@ -174,24 +178,19 @@ class Painter {
   _buildSplats() {
     const { gl } = this;
     this.splats = this._program(SPLAT_VERTEX, SPLAT_FRAGMENT);
-    this.instances = gl.createVertexArray();
-    gl.bindVertexArray(this.instances);
-    this.order = gl.createBuffer();
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
-    gl.bufferData(gl.ARRAY_BUFFER, 4 * Math.max(this.count, 1), gl.DYNAMIC_DRAW);
-    const place = gl.getAttribLocation(this.splats.program, "splat");
-    gl.enableVertexAttribArray(place);
-    gl.vertexAttribIPointer(place, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.vertexAttribDivisor(place, 1);
-    gl.bindVertexArray(this.none);
+    this.order = this._texture(gl.R32UI, WIDTH, Math.floor(this.count / WIDTH) + 1);
+    const corners = new Uint16Array(6 * BATCH).map((_, k) => 4 * Math.floor(k / 6) + [0, 1, 2, 2, 1, 3][k % 6]);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
   }
 
   // The rows to draw, far to near.
   setOrder(rows) {
     const { gl } = this;
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
-    gl.bufferSubData(gl.ARRAY_BUFFER, 0, rows);
-    this.drawn = rows.length;
+    const whole = Math.floor((this.drawn = rows.length) / WIDTH), format = [gl.RED_INTEGER, gl.UNSIGNED_INT, rows];
+    gl.bindTexture(gl.TEXTURE_2D, this.order);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, whole, ...format, 0);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, whole, rows.length % WIDTH, 1, ...format, whole * WIDTH);
   }
 
   // Evaluate the field for rows [first, first + rows) of the texture.
@@ -228,15 +227,14 @@ class Painter {
     gl.useProgram(splats.program);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    this._bind(splats, { table: this.table, looks: this.looks });
+    this._bind(splats, { table: this.table, looks: this.looks, order: this.order });
     gl.uniformMatrix4fv(splats.at("view"), true, [...view, 0, 0, 0, 1]);
     gl.uniform4fv(splats.at("lens"), lens);
     gl.uniform2f(splats.at("size"), width, height);
     gl.uniform1f(splats.at("near"), this.near);
     gl.uniform1i(splats.at("antialiased"), this.header.render.rasterize_mode === "antialiased" ? 1 : 0);
-    gl.bindVertexArray(this.instances);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.drawn);
-    gl.bindVertexArray(this.none);
+    gl.uniform1i(splats.at("drawn"), this.drawn);
+    gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(this.drawn / BATCH));
     gl.disable(gl.BLEND);
 
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
