@@ -28,9 +28,9 @@ APPEARANCE = "pipeline.model.appearance."
 INTRODUCTION = """# Options
 
 **What this package adds to nerfstudio's options, or sets in its own way; `ns-train nrfgs --help` lists all.** Defaults
-are `nrfgs`'s. The methods for comparison (`nrfgs-sh`, ...) have `view-noise`, `few-views`, `shrinkage`, `dense-start`
-and `near-plane` off, splatfacto's densification, and 30,000 steps without averaging; each can be switched on. Cameras
-lie within [-1, 1] scene units. `python -m nrfgs_lab.pages.options` writes this page.
+are `nrfgs`'s. `nrfgs-sh`, `nrfgs-vdgs`, `nrfgs-gsnb` and `nrfgs-sg` have `view-noise`, `few-views`, `shrinkage`,
+`dense-start` and `near-plane` off, splatfacto's densification, and 30,000 steps without averaging; each can be switched
+on. Cameras lie within [-1, 1] scene units. `python -m nrfgs_lab.pages.options` writes this page.
 """
 SPLATFACTOS = {field.name for field in dataclasses.fields(SplatfactoModelConfig)}
 """Options of splatfacto's model, not explained here."""
