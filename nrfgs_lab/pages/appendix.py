@@ -4,9 +4,9 @@
 from collections import defaultdict
 from statistics import fmean, median
 
-from nrfgs_lab.pages.few_views import FEW, FIELD, SAME, SHRUNK, _cell, _views, runs_of, today
+from nrfgs_lab.pages.few_views import FEW, FIELD, SAME, SHRUNK, cell, runs_of, today, views_of
 from nrfgs_lab.pages.runs import VIEWS, grid, mean, records, signed
-from nrfgs_lab.pages.speed import RENDERERS, _scale
+from nrfgs_lab.pages.speed import RENDERERS, scale_cells
 
 RIVALS = {
     "`nrfgs` with splatfacto's densification": "nrfgs",
@@ -58,7 +58,7 @@ def default() -> str:
 def rivals() -> str:
     """Today's default beside splatfacto's densification and 150,000 splats by 3DGS-MCMC, on test views."""
     body = [
-        [f"{scene}, {views}", _cell(today(scene, FIELD)), *(_cell(runs_of(scene, name)) for name in RIVALS.values())]
+        [f"{scene}, {views}", cell(today(scene, FIELD)), *(cell(runs_of(scene, name)) for name in RIVALS.values())]
         for scene, views in VIEWS.items()
     ]
     return grid(["capture, training views", "`nrfgs`", *RIVALS], body)
@@ -76,7 +76,7 @@ def gains_of(study: str, rows: dict[str, tuple[str, str]]) -> str:
     """Gains of trials over others on the held-out views that both have, and their share of the others' splats."""
     body = []
     for label, trials in rows.items():
-        ours, theirs = (_views(study, trial) for trial in trials)
+        ours, theirs = (views_of(study, trial) for trial in trials)
         cells = [_held_out_gain(ours, theirs, [v for v in theirs if v in ours and v[0] == scene]) for scene in FEW]
         splats = [defaultdict(list), defaultdict(list)]
         for one in records(study).values():
@@ -112,7 +112,7 @@ def gaps() -> str:
 def scale(column: str, factor: str, form: str) -> str:
     """A quantity of training steps after growth, medians of repeats."""
     body = []
-    for (count, pixels), cells in _scale(column).items():
+    for (count, pixels), cells in scale_cells(column).items():
         values = (format(median(cells[one]) * float(factor), form) for one in RENDERERS)
         body.append([f"{count / 1e6:g}M, {pixels:g} MP", *values])
     return grid(["splats, image", *RENDERERS.values()], body)

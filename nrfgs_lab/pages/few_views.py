@@ -53,7 +53,7 @@ def captures() -> str:
     for scene, views in VIEWS.items():
         field, host, harmonics = today(scene, FIELD), runs_of(scene, HOST), today(scene, SAME)
         gains = view_gains(field, harmonics)
-        cells = [*map(_cell, (field, host, harmonics)), f"{_ahead(gains)}: {verdict(gains)}"]
+        cells = [*map(cell, (field, host, harmonics)), f"{_ahead(gains)}: {verdict(gains)}"]
         body.append([f"{scene}, {views}", *cells])
     return grid(
         ["capture, training views", "`nrfgs`", "splatfacto", "harmonics, same rules", "field - harmonics"], body
@@ -92,7 +92,7 @@ def demo(what: str) -> str:
     return f"{min(seconds):.0f} to {max(seconds):.0f}"
 
 
-def _cell(runs: Trainings) -> str:
+def cell(runs: Trainings) -> str:
     return f"{mean(runs, 'psnr'):.2f}/{mean(runs, 'ssim'):.3f}" if runs else "-"
 
 
@@ -101,7 +101,7 @@ def _cell(runs: Trainings) -> str:
 Views = dict[tuple[str, str, str], tuple[float, float]]
 
 
-def _views(study: str, trial: str) -> Views:
+def views_of(study: str, trial: str) -> Views:
     """Means over seeds on the views of a trial."""
     values = defaultdict(list)
     for one in records(study).values():
@@ -114,7 +114,7 @@ def _views(study: str, trial: str) -> Views:
 
 def rules_gain() -> str:
     """Least and most that today's rules gain over splatfacto's on the held-out views of a capture of few views."""
-    ours, theirs = (_views("default", trial) for trial in ("by error, dense start, near plane", "splatfacto's rules"))
+    ours, theirs = (views_of("default", trial) for trial in ("by error, dense start, near plane", "splatfacto's rules"))
     pairs = [[(ours[view], theirs[view]) for view in theirs if view in ours and view[0] == scene] for scene in FEW]
     psnr = [median(one[0] - other[0] for one, other in views) for views in pairs]
     ssim = [fmean(one[1] - other[1] for one, other in views) for views in pairs]

@@ -101,7 +101,7 @@ RENDERERS = {"nrfgs": "`nrfgs`", "nrfgs-sh": "`nrfgs-sh`", "splatfacto": "splatf
 RENDERERS |= {"gsplat": "gsplat, bare", "faster-gs": "Faster-GS, bare"}
 
 
-def _scale(column: str) -> dict[tuple[int, float], dict[str, list[float]]]:
+def scale_cells(column: str) -> dict[tuple[int, float], dict[str, list[float]]]:
     """(splats, megapixels) -> renderer -> a quantity in each repeat."""
     places: dict[tuple[int, float], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for one in records("scale").values():
@@ -112,8 +112,8 @@ def _scale(column: str) -> dict[tuple[int, float], dict[str, list[float]]]:
 
 def scale_frames() -> str:
     """Frames per second at two sizes, medians of repeats."""
-    large, body = _scale("4K"), []
-    for place, small in _scale("1080p").items():
+    large, body = scale_cells("4K"), []
+    for place, small in scale_cells("1080p").items():
         rates = (f"{median(small[one]):.0f}/{median(large[place][one]):.0f}" for one in RENDERERS)
         body.append([f"{place[0] / 1e6:g}M", *rates])
     return grid(["splats", *RENDERERS.values()], body)
@@ -121,20 +121,20 @@ def scale_frames() -> str:
 
 def scale_ratio(column: str, other: str) -> str:
     """Least and most that `nrfgs` has of another renderer's quantity over the table's cells."""
-    ratios = [median(cells["nrfgs"]) / median(cells[other]) for cells in _scale(column).values()]
+    ratios = [median(cells["nrfgs"]) / median(cells[other]) for cells in scale_cells(column).values()]
     return span(ratios, "{:.2f}".format)
 
 
 def scale_fit(column: str, factor: str, unit: str, renderer: str) -> str:
     """Least squares of a quantity by splats and pixels."""
-    cells = {place: float(factor) * median(cells[renderer]) for place, cells in _scale(column).items()}
+    cells = {place: float(factor) * median(cells[renderer]) for place, cells in scale_cells(column).items()}
     parts = np.linalg.lstsq([[1, count / 1e6, pixels] for count, pixels in cells], [*cells.values()], rcond=None)[0]
     return f"{parts[0]:.1f} {unit}, {parts[1]:.1f} for each million splats and {parts[2]:.2f} for each megapixel"
 
 
 def scale_spread() -> str:
     """By how much a cell's slowest repeat is above its fastest, the median over cells with repeats."""
-    repeats = [values for cells in _scale("step_ms").values() for values in cells.values() if len(values) > 1]
+    repeats = [values for cells in scale_cells("step_ms").values() for values in cells.values() if len(values) > 1]
     return f"{100 * median(max(values) / min(values) - 1 for values in repeats):.0f} %"
 
 

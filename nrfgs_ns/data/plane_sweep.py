@@ -248,8 +248,8 @@ def _transfer(views: Views, one: int, others: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _mean_of_largest(rows: Tensor, count: int) -> Tensor:
-    """Mean of the `count` largest along the first dimension, which is short: by exchanges of whole rows, a tenth of the
-    time of `topk`."""
+    """Mean of the `count` largest along the first dimension, which is short: by exchanges of whole rows, on a CPU
+    quicker than `topk`."""
     sorted_rows = list(rows)
     for first in range(count):
         for at in range(len(sorted_rows) - 1, first, -1):
@@ -259,8 +259,8 @@ def _mean_of_largest(rows: Tensor, count: int) -> Tensor:
 
 
 def _window_mean(images: Tensor) -> Tensor:
-    """Means over windows [N, C, H, W], which end at the image's edges: by sums of shifted images, on a CPU in a quarter
-    of `avg_pool2d`'s time."""
+    """Means over windows [N, C, H, W], which end at the image's edges: by sums of shifted images, on a CPU quicker than
+    `avg_pool2d`."""
     half = WINDOW // 2
     for padding, dim in (((half, half), -1), ((0, 0, half, half), -2)):
         size = images.shape[dim]
