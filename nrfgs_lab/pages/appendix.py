@@ -16,13 +16,29 @@ RIVALS = {
 }
 """Label -> trainings in results/captures.json."""
 GAPS = {
+    "**twice the residual, on the logit**: `nrfgs`": "twice on the logit",
+    "residual on the logit": "on the logit",
+    "four times the residual, on the logit": "four times on the logit",
+    "dead by the stored opacity": "dead by the stored opacity",
+    "on the logit, dead by the stored opacity": "on the logit, dead by the stored opacity",
     "harmonics, same rules": "harmonics",
+    "harmonics of degree 1": "harmonics, degree 1",
     "field without opacity residual": "no opacity residual",
     "field, rates a tenth (latents), a fifth (network)": "slow field",
     "field, one band": "one band",
     "field without distance": "no distance",
 }
-"""Label -> trial with gaps in results/default.json."""
+"""Label -> trial with gaps in results/default.json; its default added the residual to the opacity."""
+HALF_SIZE = {
+    "**twice the residual, on the logit**": "twice on the logit",
+    "**and a threshold of 0.0018**: `nrfgs` on `bonsai`": "twice on the logit, threshold 0.0018",
+    "four times the residual, on the logit": "four times on the logit",
+    "residual on the logit": "on the logit",
+    "residual on the logit, threshold 0.0018": "on the logit, threshold 0.0018",
+    "dead by the stored opacity": "dead by the stored opacity",
+    "harmonics, same rules": "harmonics",
+}
+"""Label -> trial with every eighth training view held out, against the same default."""
 RULES = {
     "**by error, points from photographs, near plane**": "by error, dense start, near plane",
     "without the near plane": "by error, dense start",
@@ -45,7 +61,8 @@ def default() -> str:
     for scene, views in VIEWS.items():
         for label, runs in (("field", today(scene, FIELD)), ("harmonics", today(scene, SAME))):
             seeds = ", ".join(f"{one['psnr']:.2f}" for one in runs)
-            means = [f"{mean(runs, metric):.3f}" for metric in ("ssim", "ms_ssim", "flip")]
+            metrics = [metric for metric in ("ssim", "ms_ssim", "flip") if all(metric in one for one in runs)]
+            means = [f"{mean(runs, metric):.3f}" for metric in metrics] + ["-"] * (3 - len(metrics))
             middle = fmean(median(view[1] for view in one["per_image"]) for one in runs)
             worst = min(view[1] for one in runs for view in one["per_image"])
             gap = mean(runs, "train_psnr") - mean(runs, "psnr")
@@ -88,25 +105,45 @@ def gains_of(study: str, rows: dict[str, tuple[str, str]]) -> str:
     return grid(["", *FEW, "splats"], body)
 
 
-def gaps() -> str:
-    """Changes of PSNR and SSIM by trials with gaps between training views, against the default."""
-    runs = {capture: {} for capture in VIEWS}
+def _changes(sitting: str, trial: str) -> dict[str, tuple[float, float, float, int]]:
+    """Changes by a trial of a sitting, against its default with the same seeds, by capture: PSNR and SSIM, the share of
+    the default's splats, and the number of pairs."""
+    runs = {}
     for one in records("default").values():
-        if one["name"].startswith("gaps: "):
-            where, _, capture = one["scene"].rpartition("/")
-            runs[capture][one["name"][6:], where] = one
+        kind, _, name = one["name"].partition(": ")
+        if kind == sitting and name in ("default", trial):
+            runs[name, one["scene"], one["seed"]] = one
+    pairs = defaultdict(list)
+    for (name, scene, seed), one in runs.items():
+        if name == trial and ("default", scene, seed) in runs:
+            base = runs["default", scene, seed]
+            change = *(one[metric] - base[metric] for metric in ("psnr", "ssim")), one["splats"] / base["splats"]
+            pairs[scene.rpartition("/")[2]].append(change)
+    return {scene: (*map(fmean, zip(*them, strict=True)), len(them)) for scene, them in pairs.items()}
+
+
+def changes(trials: dict[str, str], sitting: str) -> str:
+    """Changes by trials on each capture: dB/SSIM x 1000, share of splats, and pairs of trainings."""
+    rows = {label: _changes(sitting, trial) for label, trial in trials.items()}
+    captures = [scene for scene in VIEWS if any(scene in row for row in rows.values())]
     body = []
-    for label, trial in GAPS.items():
+    for label, row in rows.items():
         cells = []
-        for mine in runs.values():
-            pairs = [(one, mine["default", where]) for (name, where), one in mine.items() if name == trial]
-            gains = [
-                a[1] - b[1] for one, base in pairs for a, b in zip(one["per_image"], base["per_image"], strict=True)
-            ]
-            dB, ssim = (fmean(one[metric] - base[metric] for one, base in pairs) for metric in ("psnr", "ssim"))
-            cells.append(f"{signed(dB, 2)}/{signed(1000 * ssim, 0)} ({sum(one > 0 for one in gains)}/{len(gains)})")
+        for dB, ssim, share, number in (row.get(scene, (None,) * 4) for scene in captures):
+            cells.append(f"{signed(dB, 2)}/{signed(1000 * ssim, 0)}, x{share:.1f} ({number})" if number else "-")
         body.append([label, *cells])
-    return grid(["", *runs], body)
+    return grid(["", *captures], body)
+
+
+def logit() -> str:
+    """Mean change by today's opacity residual on held-out views, with few and with all training views."""
+    texts = []
+    for sitting, where in (("gaps", "with 13 to 24 training views"), ("half size", "with 37 to 223")):
+        changed = _changes(sitting, "twice on the logit").values()
+        dB, ssim, share = (fmean(one[number] for one in changed) for number in range(3))
+        numbers = f"{signed(dB, 2)} dB and {signed(ssim, 3)} SSIM with {share:.1f} of the splats"
+        texts.append(f"{numbers} in the mean of {len(changed)} captures {where}")
+    return ", and ".join(texts)
 
 
 def scale(column: str, factor: str, form: str) -> str:
@@ -122,6 +159,8 @@ BLOCKS = {
     "tables.default": default,
     "tables.rivals": rivals,
     "tables.rules": lambda: gains_of("default", {label: (one, "splatfacto's rules") for label, one in RULES.items()}),
-    "tables.gaps": gaps,
+    "captures.logit": logit,
+    "tables.gaps": lambda: changes(GAPS, "gaps"),
+    "tables.half_size": lambda: changes(HALF_SIZE, "half size"),
     "tables.scale": scale,
 }

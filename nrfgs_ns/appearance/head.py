@@ -59,7 +59,7 @@ class AppearanceHeadConfig:
         return self
 
     def for_copies(self) -> "AppearanceHeadConfig":
-        """The configuration where densification replaces a splat by copies that share its opacity (3DGS-MCMC)."""
+        """The configuration where densification replaces a splat by others that share its opacity."""
         return self
 
     def require(self, holds: bool, name: str, needed: str) -> None:

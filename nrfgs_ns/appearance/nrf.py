@@ -62,14 +62,14 @@ class NrfConfig(AppearanceHeadConfig):
     color_scale: float = 0.2
     """s_c: largest change of a colour channel, in units of white"""
     opacity_scale: float = 0.2
-    """s_alpha: largest change of opacity"""
+    """s_alpha: largest change of opacity; where `opacity_bound` is not given, twice this on the logit"""
     distance_eps: float = NEAREST
     """smallest camera distance, in scene units; shorter ones count as this. The near plane"""
     output_init: Literal["zero", "default"] = "zero"
     """start of the output layers. zero: no residual. default: torch's, as in the paper, followed by the warm-up"""
     opacity_bound: OpacityBound | None = None
     """how base + residual stays in [0, 1] (docs/deviations.md). straight-through: clamped, but the gradient ignores the
-    clamp. logit: the residual is added to the logit. None: logit for mcmc, otherwise straight-through"""
+    clamp. logit: the residual is added to the logit. None: logit for error-guided and mcmc"""
     implementation: Literal["auto", "torch", "fused"] = "auto"
     """auto: fused Triton kernels on CUDA where they can run, PyTorch elsewhere. fused: an error instead of PyTorch"""
     precision: Literal["fp32", "tf32", "bf16", "fp16"] = "bf16"
@@ -85,8 +85,11 @@ class NrfConfig(AppearanceHeadConfig):
         return replace(self, opacity_scale=share * self.opacity_scale) if self.opacity_residual else self
 
     def for_copies(self) -> "NrfConfig":
-        """Residuals on the logit, by default: n copies of a splat would each add a whole residual to their opacity."""
-        return self if self.opacity_bound or not self.opacity_residual else replace(self, opacity_bound="logit")
+        """By default twice the residual, on the logit: n copies of a splat would each add a whole one to their opacity,
+        and one in which a view sees nothing would be seen by others."""
+        if self.opacity_bound or not self.opacity_residual:
+            return self
+        return replace(self, opacity_bound="logit", opacity_scale=2 * self.opacity_scale)
 
     def validate(self) -> None:
         self.require(1 <= self.latent_dim <= 1024, "latent_dim", "from 1 to 1024")

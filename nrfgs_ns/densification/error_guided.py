@@ -57,7 +57,7 @@ DECAY = 0.004
 """Opacity that the first refinement takes from each splat; the amount falls linearly to 0 over the training."""
 LAYOUT = 30_000
 """Steps of the training that the options' steps belong to."""
-MANY_VIEWS = 210
+MANY_VIEWS = 300
 """Training views that double the threshold: their trainings are longer, and more splats would cost them much time."""
 WIDEST = 0.75
 """Radius from which a splat is split whatever its error: three standard deviations, in longer sides of the image."""
@@ -68,13 +68,14 @@ class ErrorGuided(DensificationConfig):
     """Growth where the error is: the number of splats follows from the capture."""
 
     name: ClassVar[str] = "error-guided"
+    copies_splats: ClassVar[bool] = True
     opacity_seen: OpacitySeen = "peak"
     """opacity by which splats are dead (docs/deviations.md). base: stored. peak: largest shown in two windows"""
     refine_every: int = 200
     """steps between refinements; the views of these are a window"""
     threshold: float = 0.0025
     """error above which a splat may be split: the smaller, the more splats and detail. V different training views raise
-    it by the factor 1 + (V / 210)^2"""
+    it by the factor 1 + (V / 300)^2"""
     budget: int = 0
     """number of splats to grow to, whatever their error (arXiv 2605.16158). 0: the threshold decides"""
     most_splats: int = 2_000_000

@@ -72,7 +72,7 @@ class DensificationConfig(ABC):
     name: ClassVar[str]
     """what it is called on the command line and in checkpoints"""
     copies_splats: ClassVar[bool] = False
-    """replaces splats by copies that share their opacity, which heads adapt to (`AppearanceHeadConfig.for_copies`)"""
+    """replaces splats by ones that share their opacity, which heads adapt to (`AppearanceHeadConfig.for_copies`)"""
     regularises: ClassVar[bool] = False
     """adds terms for opacity and size to the loss, in place of the model's `shrinkage`"""
     shrinkage: ClassVar[float] = 0.0

@@ -72,7 +72,7 @@ def test_the_error_is_the_largest_of_a_view_however_many_there_are():
 
 
 def test_many_different_views_raise_the_threshold():
-    thresholds = [ErrorGuided(threshold=0.001).build(999, views, 1.0).raised for views in (1, 21, 210, 420)]
+    thresholds = [ErrorGuided(threshold=0.001).build(999, views, 1.0).raised for views in (1, 30, 300, 600)]
     assert thresholds == pytest.approx([0.001, 0.00101, 0.002, 0.005], rel=1e-3)
 
 

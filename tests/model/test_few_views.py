@@ -77,16 +77,18 @@ def test_nothing_is_drawn_before_half_the_nearest_depth(tiny_scene, tmp_path, no
     assert off.projection_options.near_plane == 0.01 * off.scene_unit
 
 
-def test_mcmc_has_residuals_on_the_logit(tiny_scene, tmp_path, no_cuda, capsys):
+def test_residuals_are_on_the_logit_where_splats_share_their_opacity(tiny_scene, tmp_path, no_cuda, capsys):
     mcmc = {"--pipeline.model.densification": "mcmc,warmup_length=2,refine_every=4,budget=300"}
     config = trained(command_line("nrfgs", tiny_scene, tmp_path / "mcmc", 3, REFINING, mcmc))
     assert "view dependence reduced" in capsys.readouterr().out
     again = ready(tiny_scene, tmp_path / "again", 4, mcmc, {"--load-dir": models_of(config)}).pipeline.model
-    assert again.head.config == NrfConfig(opacity_scale=8 / 28 * 0.2, opacity_bound="logit")
+    assert again.head.config == NrfConfig(opacity_scale=2 * 8 / 28 * 0.2, opacity_bound="logit")
     asked_for = {"--pipeline.model.appearance.opacity-bound": "straight-through"}
     chosen = ready(tiny_scene, tmp_path / "asked", 1, mcmc, asked_for).pipeline.model.head.config
     assert chosen.bound == "straight-through"
-    assert ready(tiny_scene, tmp_path / "other", 1).pipeline.model.head.config.bound == "straight-through"
+    for strategy, bound in (("error-guided", "logit"), ("splatfacto", "straight-through")):
+        other = ready(tiny_scene, tmp_path / strategy, 1, {"--pipeline.model.densification": strategy})
+        assert other.pipeline.model.head.config.bound == bound
     alone = NrfConfig(opacity_residual=False)
     assert alone.for_copies() == alone.trusted(0.5) == alone
 
