@@ -145,7 +145,7 @@ class ErrorGuidedDensification(Densification):
             return
         self._take_statistics(step, info, len(splats["means"]))
         if step > self.start and step % self.config.refine_every == 0:
-            self._refine(step, splats, optimizers)
+            self._refine(step, info, splats, optimizers)
             self.begin_another_window()
             self.state[ERROR].zero_()
             self.state[WIDTH].zero_()
@@ -168,7 +168,7 @@ class ErrorGuidedDensification(Densification):
 
     # What a refinement does.
 
-    def _refine(self, step: int, splats: Splats, optimizers: Optimizers) -> None:
+    def _refine(self, step: int, info: Mapping[str, Any], splats: Splats, optimizers: Optimizers) -> None:
         """Replace the dead, split where the error is, and take a little from all opacities."""
         state, count, self.moved_at = self.state, len(splats["means"]), step
         opacities, wide = self.seen_opacity(splats["opacities"]), state[WIDTH] > WIDEST
@@ -178,7 +178,9 @@ class ErrorGuidedDensification(Densification):
         grown = parents[:0]
         if step < self.grow_until:
             weights, wanted = self._candidates(step, count, dead, wide, len(places))
-            grown = draw(weights.index_fill(0, parents, 0.0), min(wanted, self.config.most_splats - count))
+            wanted = max(min(wanted, self.config.most_splats - count), 0)
+            wanted = self.fitting(step, info, splats, optimizers, wanted)
+            grown = draw(weights.index_fill(0, parents, 0.0), wanted)
         split(splats, optimizers, torch.cat([parents, grown]), places)
         source = torch.cat([torch.arange(count, device=dead.device).index_copy(0, places, parents), grown])
         for name in state.keys() & {ERROR, WIDTH, CHANGE, CHANGE_BEFORE}:

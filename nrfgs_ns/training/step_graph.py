@@ -24,6 +24,7 @@ from torch.func import functional_call
 
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.data.checks import warn
+from nrfgs_ns.densification.memory import give_back
 from nrfgs_ns.image.metrics import WINDOW_SIZE
 from nrfgs_ns.model.loss import loss_of
 from nrfgs_ns.model.renderer import Pinhole, composite_view, project_view, render_view
@@ -224,6 +225,7 @@ class _StepGraph:
                 self._compute()  # once outside the recording: first calls compile and allocate
                 for generator, state in zip(generators, states, strict=True):
                     generator.set_state(state)
+                give_back(device)
                 self.graph.capture_begin(capture_error_mode="thread_local")  # a viewer has a thread of its own
                 try:
                     self._compute()
