@@ -53,8 +53,8 @@ def test_the_estimate(share, free, limit, monkeypatch):
 
 
 def test_a_cpu_is_not_asked(monkeypatch):
-    monkeypatch.setattr(torch, "cuda", None)
     table = Table(3)
+    monkeypatch.setattr(torch, "cuda", None)
     assert memory.most_splats(table.splats, table.optimizers, 0) == sys.maxsize
     assert memory.allowed(torch.device("cpu")) == 0
     memory.give_back(torch.device("cpu"))
