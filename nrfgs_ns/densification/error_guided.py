@@ -38,9 +38,7 @@ from nrfgs_ns.densification.strategy import (
     DensificationConfig,
     OpacitySeen,
     Optimizers,
-    Shown,
     Splats,
-    changes_shown,
 )
 
 ERROR = "error"
@@ -104,7 +102,6 @@ class ErrorGuidedDensification(Densification):
     """Splits by error, replacement by opacity, decay of opacity."""
 
     name = ErrorGuided.name
-    takes_all_rows = True
 
     def __init__(self, config: ErrorGuided, raised: float):
         super().__init__(config.opacity_seen)
@@ -130,11 +127,7 @@ class ErrorGuidedDensification(Densification):
     # What a step shows.
 
     def pre_backward(self, step: int, info: dict[str, Any], opacities: Tensor, logits: Tensor) -> None:
-        """See `Densification`. What a view shows is left in `info`: a recorded step fills it anew each time."""
-        rows = info["gaussian_ids"]
-        self.shown = Shown(rows, opacities, info.get("n_cameras", 1))
-        if self.opacity_seen == "peak":
-            info["change"] = torch.where(info["radii"] > 0, changes_shown(logits, rows, opacities), UNSEEN)
+        super().pre_backward(step, info, opacities, logits)
         if step < self.grow_until:
             info["means2d"].retain_grad()
 

@@ -169,10 +169,6 @@ class GradientDensification(Densification):
     def needs_absgrad(self, step: int) -> bool:
         return self.strategy.absgrad and step < self.strategy.refine_stop_iter
 
-    @property
-    def takes_all_rows(self) -> bool:
-        return self.opacity_seen == "base"
-
     def rests_at(self, step: int) -> bool:
         return step >= self.strategy.refine_stop_iter
 
@@ -182,13 +178,14 @@ class GradientDensification(Densification):
             spread = (centers - centers.mean(dim=0)).norm(dim=-1).max().item()
             self.state["scene_scale"] = EXTENT_MARGIN * spread or 1.0  # one camera has no extent
 
-    def pre_backward(self, step: int, info: Mapping[str, Any], opacities: Tensor, logits: Tensor) -> None:
+    def pre_backward(self, step: int, info: dict[str, Any], opacities: Tensor, logits: Tensor) -> None:
         super().pre_backward(step, info, opacities, logits)
         if step < self.strategy.refine_stop_iter:
             info["means2d"].retain_grad()
 
     def post_backward(self, step, info, splats, optimizers) -> None:
         strategy, self.shown = self.strategy, None
+        self.take_changes(info, len(splats["means"]))
         if step < strategy.refine_stop_iter:
             self._take_statistics(info, len(splats["means"]))
             if step == 0 and self.measure_by_cameras:

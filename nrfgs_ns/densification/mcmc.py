@@ -75,9 +75,13 @@ class McmcDensification(Densification):
         self.config, self.budget, self.scene_unit = config, config.budget, scene_unit
         self.start, self.stop = config.warmup_length, config.stop_at
 
+    def rests_at(self, step: int) -> bool:
+        return step >= self.stop
+
     @torch.no_grad()
     def post_backward(self, step, info, splats, optimizers) -> None:
         self.shown = None
+        self.take_changes(info, len(splats["means"]))
         if step > self.start and step % self.config.refine_every == 0:
             if step < self.stop:
                 self._relocate_and_add(step, info, splats, optimizers)

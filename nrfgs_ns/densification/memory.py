@@ -49,5 +49,10 @@ def most_splats(splats: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer
 def give_back(device: torch.device) -> None:
     """Give back what torch keeps of a GPU for later, where memory may become short: `most_splats` counts it as in use,
     and a graph that is being recorded does not get it."""
-    if device.type == "cuda" and torch.cuda.memory_reserved(device) > allowed(device) / 2:
+    if is_half_used(device):
         torch.cuda.empty_cache()
+
+
+def is_half_used(device: torch.device) -> bool:
+    """Whether more than half of a GPU's memory is in use; never on a CPU."""
+    return device.type == "cuda" and torch.cuda.memory_reserved(device) > allowed(device) / 2

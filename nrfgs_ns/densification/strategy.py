@@ -161,8 +161,6 @@ class Densification(ABC):
 
     moved_at: int | None = None
     """Last step at which rows of the table came to denote other splats although no tensor was replaced."""
-    takes_all_rows: bool = False
-    """Whether steps can be recorded: it ignores rows of radius 0 (invisible splats) and adds no term to the loss."""
 
     def rests_at(self, step: int) -> bool:
         """Whether it needs no gradients of this step; splats may still be replaced."""
@@ -182,8 +180,10 @@ class Densification(ABC):
             fix = "With --pipeline.model.dense-start off it may begin with fewer."
             warn(f"The budget of {self.name} is {self.budget}, but the training begins with {num_splats} points. {fix}")
 
-    def pre_backward(self, step: int, info: Mapping[str, Any], opacities: Tensor, logits: Tensor) -> None:
-        """Look at a training view before the loss goes backward.
+    def pre_backward(self, step: int, info: dict[str, Any], opacities: Tensor, logits: Tensor) -> None:
+        """Look at a training view before the loss goes backward. A recorded step (`training/step_graph.py`) does so
+        once for all its steps, with a row for each splat, of radius 0 where it is not visible, and fills what is left
+        in `info` anew each time.
 
         Args:
             step: training step.
@@ -193,14 +193,19 @@ class Densification(ABC):
         """
         self.shown = Shown(info["gaussian_ids"], opacities, info.get("n_cameras", 1))
         if self.opacity_seen == "peak":
-            rows = info["gaussian_ids"]
-            if self.state[CHANGE] is None:
-                self.state[CHANGE] = logits.new_full((len(logits),), UNSEEN)
-            self.state[CHANGE].scatter_reduce_(0, rows, changes_shown(logits, rows, opacities), "amax")
+            changes = changes_shown(logits, info["gaussian_ids"], opacities)
+            info["change"] = torch.where(info["radii"] > 0, changes, UNSEEN)
 
     @abstractmethod
     def post_backward(self, step: int, info: Mapping[str, Any], splats: Splats, optimizers: Optimizers) -> None:
         """Change the table after the optimisers' step, given the `info` of `pre_backward` with gradients."""
+
+    def take_changes(self, info: Mapping[str, Any], count: int) -> None:
+        """Let the window's changes of opacity be at least those of a step."""
+        if self.opacity_seen == "peak":
+            if self.state[CHANGE] is None:
+                self.state[CHANGE] = torch.full((count,), UNSEEN, device=info["change"].device)
+            self.state[CHANGE].scatter_reduce_(0, info["gaussian_ids"], info["change"], "amax")
 
     def fitting(self, step: int, info: Mapping[str, Any], splats: Splats, optimizers: Optimizers, wanted: int) -> int:
         """How many of `wanted` more splats the GPU has memory for. Called in every refinement that may grow.
@@ -235,7 +240,7 @@ class Densification(ABC):
         if self.shown is None:
             return torch.sigmoid(logits).mean()
         rows, opacities, cameras = self.shown
-        if cameras == 1 and len(rows) == len(logits):  # all are shown, or have a row (`takes_all_rows`)
+        if cameras == 1 and len(rows) == len(logits):  # all are shown, or have a row
             return opacities.mean()
         stored = torch.sigmoid(logits).flatten()
         # By index_select: the gradient of an index is a sort of all rows.
