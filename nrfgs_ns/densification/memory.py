@@ -10,6 +10,8 @@ from torch.optim import Optimizer
 
 SHARE = 0.9
 """Share of the memory that growth may fill: it is not in one piece, and views differ."""
+PLENTY = 0.25
+"""Share of the memory up to which splats may be doubled whatever it holds."""
 BYTES_PER_PIXEL = 200
 """What a step holds of a pixel: the image, the photograph and SSIM's means of both, with their gradients."""
 
@@ -46,13 +48,13 @@ def most_splats(splats: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer
     return max(int(count * room / (held - fixed + copied)), 0)
 
 
+def share_used(device: torch.device) -> float:
+    """Share of a GPU's memory that torch has; 0 on a CPU."""
+    return torch.cuda.memory_reserved(device) / allowed(device) if device.type == "cuda" else 0.0
+
+
 def give_back(device: torch.device) -> None:
-    """Give back what torch keeps of a GPU for later, where memory may become short: `most_splats` counts it as in use,
-    and a graph that is being recorded does not get it."""
-    if is_half_used(device):
+    """Give back what torch keeps of a GPU for later: `most_splats` counts it as in use, and a graph that is being
+    recorded does not get it. Nothing where memory is plentiful, since it costs time to get it again."""
+    if share_used(device) > PLENTY:
         torch.cuda.empty_cache()
-
-
-def is_half_used(device: torch.device) -> bool:
-    """Whether more than half of a GPU's memory is in use; never on a CPU."""
-    return device.type == "cuda" and torch.cuda.memory_reserved(device) > allowed(device) / 2

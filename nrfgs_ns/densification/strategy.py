@@ -33,8 +33,8 @@ CHANGE = "opacity_change"
 CHANGE_BEFORE = CHANGE + "_before"
 """The same in the window before, for strategies that look at two (`begin_another_window`)."""
 HELD = "held_at"
-"""The same of the number of splats beyond which memory let none grow, and of the memory that this was found in, in
-bytes; None: it was never short."""
+"""Name, in a strategy's `state`, of a pair: the number of splats at which memory has held growth, and the bytes of
+memory that there were; None: it was never short."""
 UNSEEN = -2.0
 """Change of a splat that no view has shown: less than any change."""
 
@@ -219,9 +219,9 @@ class Densification(ABC):
             most = self.least(memory.most_splats(splats, optimizers, later))
             if self.least(most - count - wanted) >= 0:
                 return wanted
-            self.state[HELD] = max(most, count), within
+            self.state[HELD] = most, within
             if self.verbose:
-                held = f"growth is held at {self.state[HELD][0]:,} splats a GPU, since its memory has no room for more"
+                held = f"growth is held at {max(most, count):,} splats a GPU, since its memory has no room for more"
                 print(f"Step {step}: {held}. Smaller images or more GPUs make room (docs/troubleshooting.md).")
         return min(wanted, max(self.state[HELD][0] - count, 0))
 

@@ -92,7 +92,7 @@ class StepGraphs:
         """Whether the photograph is of a kind that has no graph and gets none."""
         if len(self._graphs) < MOST_SIZES or _kind(batch) in self._graphs:
             return False
-        return not self.model.densification.rests_at(self.model.step) or memory.is_half_used(self.model.device)
+        return not self.model.densification.rests_at(self.model.step) or memory.share_used(self.model.device) > 0.5
 
     def prepare(self, camera: Cameras, batch: Mapping[str, Any], step: int) -> bool:
         """Whether `run` can make this step, which it is then ready for. False where the step is the first of its kind,

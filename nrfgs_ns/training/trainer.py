@@ -102,7 +102,7 @@ class NrfgsTrainer(Trainer):
         """Add points from the photographs to those that a new training starts from."""
         if self.config.load_dir is None and self.config.load_checkpoint is None:
             notes = start_with_dense_points(self.pipeline.model, self.pipeline.datamanager)
-            give_back(self.pipeline.model.device)
+            torch.cuda.empty_cache()  # what a training holds tells how far it may grow; nothing without CUDA
             self.pipeline.notes = [*self.pipeline.notes, *notes]
 
     def setup_optimizers(self) -> Optimizers:

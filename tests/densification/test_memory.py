@@ -60,7 +60,7 @@ def test_a_cpu_is_not_asked(monkeypatch):
     memory.give_back(torch.device("cpu"))
 
 
-@pytest.mark.parametrize("reserved, times", [(5, 0), (7, 1)])
+@pytest.mark.parametrize("reserved, times", [(2, 0), (4, 1)])
 def test_memory_is_given_back_where_it_may_be_short(reserved, times, monkeypatch):
     calls = []
     card(monkeypatch, 0.5, 10, reserved, reserved)

@@ -44,7 +44,7 @@ def test_a_photograph_of_one_size_too_many_has_no_graph_and_it_is_said(build, mo
     assert "those of 4 are recorded" in graphs._obstacle({"image": torch.zeros(4, 4, 3)})
     pipeline.model.step = 29_000  # growth has ended
     assert graphs._obstacle({"image": torch.zeros(4, 4, 3)}) is None
-    monkeypatch.setattr(memory, "is_half_used", lambda device: True)
+    monkeypatch.setattr(memory, "share_used", lambda device: 0.6)
     assert "those of 4 are recorded" in graphs._obstacle({"image": torch.zeros(4, 4, 3)})
 
 
