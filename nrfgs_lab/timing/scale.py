@@ -186,6 +186,16 @@ def trainer_of(method: str, scene: Path, device: str, watch: Stopwatch, splats: 
     return trainer
 
 
+def trained(method: str, capture: Capture, device: str, watch: Stopwatch) -> Any:
+    """A trainer of nerfstudio's that has trained the capture's splats on its photographs."""
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder, host_without_downloads(method):
+        write_scene(capture, Path(folder))
+        trainer = trainer_of(method, Path(folder), device, watch, capture.splats)
+        trainer.train()
+        writer.EVENT_WRITERS.clear()  # the next training would write to this one's folder, too
+    return trainer
+
+
 class Bare:
     """Splats with harmonics of degree 3, a rasterizer, and Adam: a training without a host."""
 
@@ -249,7 +259,7 @@ class Scale:
     table: bool = False  # print what is there as Markdown, and measure nothing
 
     def main(self) -> None:
-        records = [json.loads(line) for line in self.out.read_text().splitlines()] if self.out.exists() else []
+        records = lines_of(self.out)
         if self.table:
             return print(as_table(records))
         device, done = "cuda" if torch.cuda.is_available() else "cpu", {cell_of(record) for record in records}
@@ -271,9 +281,7 @@ class Scale:
                     record |= self.measure(cell[2], capture, self.frames if megapixels == self.megapixels[0] else ())
                 except (torch.OutOfMemoryError, TrainingStopped) as error:
                     record["failed"] = str(error).partition("\n")[0]
-                records.append(record)
-                write_whole(self.out, "".join(json.dumps(record) + "\n" for record in records))
-                print(record, flush=True)
+                add_line(self.out, records, record)
 
     def measure(self, method: str, capture: Capture, sizes: tuple[str, ...]) -> dict[str, Any]:
         """Time and memory of a training's steps, and its frames per second at sizes of `FRAMES`."""
@@ -287,15 +295,23 @@ class Scale:
                 watch.before(step)
                 model.step(views[step % len(views)], photographs[step % len(views)])
         else:
-            with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder, host_without_downloads(method):
-                write_scene(capture, Path(folder))
-                trainer = trainer_of(method, Path(folder), device, watch, capture.splats)
-                trainer.train()
-                writer.EVENT_WRITERS.clear()  # the next training would write to this one's folder, too
+            trainer = trained(method, capture, device, watch)
             model, trainer.graphs = trainer.pipeline.model.eval(), None
         large = {size: [at_size(view, *FRAMES[size]) for view in views] for size in sizes}
         frames = {size: frames_per_second(model, cameras) for size, cameras in large.items()}
         return {"step_ms": watch.step_ms, "gpu_ms": watch.gpu_ms, "peak_mb": watch.peak_bytes / 1e6, **frames}
+
+
+def lines_of(file: Path) -> list[dict[str, Any]]:
+    """The records in a file of lines of JSON; none where there is no file."""
+    return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+
+
+def add_line(file: Path, records: list[dict[str, Any]], record: dict[str, Any]) -> None:
+    """Add a record to those in the file, and print it."""
+    records.append(record)
+    write_whole(file, "".join(json.dumps(record) + "\n" for record in records))
+    print(record, flush=True)
 
 
 def as_table(records: list[dict[str, Any]]) -> str:

@@ -38,9 +38,7 @@ from nrfgs_ns.densification.strategy import (
     DensificationConfig,
     OpacitySeen,
     Optimizers,
-    Shown,
     Splats,
-    changes_shown,
 )
 
 ERROR = "error"
@@ -105,7 +103,6 @@ class ErrorGuidedDensification(Densification):
     """Splits by error, replacement by opacity, decay of opacity."""
 
     name = ErrorGuided.name
-    takes_all_rows = True
 
     def __init__(self, config: ErrorGuided, raised: float):
         super().__init__(config.opacity_seen)
@@ -131,11 +128,7 @@ class ErrorGuidedDensification(Densification):
     # What a step shows.
 
     def pre_backward(self, step: int, info: dict[str, Any], opacities: Tensor, logits: Tensor) -> None:
-        """See `Densification`. What a view shows is left in `info`: a recorded step fills it anew each time."""
-        rows = info["gaussian_ids"]
-        self.shown = Shown(rows, opacities, info.get("n_cameras", 1))
-        if self.opacity_seen == "peak":
-            info["change"] = torch.where(info["radii"] > 0, changes_shown(logits, rows, opacities), UNSEEN)
+        super().pre_backward(step, info, opacities, logits)
         if step < self.grow_until:
             info["means2d"].retain_grad()
 
@@ -146,7 +139,7 @@ class ErrorGuidedDensification(Densification):
             return
         self._take_statistics(step, info, len(splats["means"]))
         if step > self.start and step % self.config.refine_every == 0:
-            self._refine(step, splats, optimizers)
+            self._refine(step, info, splats, optimizers)
             self.begin_another_window()
             self.state[ERROR].zero_()
             self.state[WIDTH].zero_()
@@ -169,7 +162,7 @@ class ErrorGuidedDensification(Densification):
 
     # What a refinement does.
 
-    def _refine(self, step: int, splats: Splats, optimizers: Optimizers) -> None:
+    def _refine(self, step: int, info: Mapping[str, Any], splats: Splats, optimizers: Optimizers) -> None:
         """Replace the dead, split where the error is, and take a little from all opacities."""
         state, count, self.moved_at = self.state, len(splats["means"]), step
         opacities, wide = self.seen_opacity(splats["opacities"]), state[WIDTH] > WIDEST
@@ -179,7 +172,9 @@ class ErrorGuidedDensification(Densification):
         grown = parents[:0]
         if step < self.grow_until:
             weights, wanted = self._candidates(step, count, dead, wide, len(places))
-            grown = draw(weights.index_fill(0, parents, 0.0), min(wanted, self.config.most_splats - count))
+            wanted = max(min(wanted, self.config.most_splats - count), 0)
+            wanted = self.fitting(step, info, splats, optimizers, wanted)
+            grown = draw(weights.index_fill(0, parents, 0.0), wanted)
         split(splats, optimizers, torch.cat([parents, grown]), places)
         source = torch.cat([torch.arange(count, device=dead.device).index_copy(0, places, parents), grown])
         for name in state.keys() & {ERROR, WIDTH, CHANGE, CHANGE_BEFORE}:

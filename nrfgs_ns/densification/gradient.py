@@ -159,7 +159,7 @@ class GradientDensification(Densification):
         self.strategy = strategy
         self.bounds = {name: getattr(strategy, name) for name in STRATEGY_BOUNDS}
         self.measure_by_cameras = scene_unit is None
-        self.budget, self.threshold = budget, strategy.grow_grad2d
+        self.budget, self.threshold, self.widest = budget, strategy.grow_grad2d, strategy.grow_scale2d
         if budget:
             self.state |= {THRESHOLD: 0.0, FIRST: None}
         self.state |= strategy.initialize_state(scene_scale=scene_unit or 1.0)
@@ -169,31 +169,29 @@ class GradientDensification(Densification):
     def needs_absgrad(self, step: int) -> bool:
         return self.strategy.absgrad and step < self.strategy.refine_stop_iter
 
-    @property
-    def takes_all_rows(self) -> bool:
-        return self.opacity_seen == "base"
-
     def rests_at(self, step: int) -> bool:
         return step >= self.strategy.refine_stop_iter
 
-    def begin(self, centers: Tensor, num_splats: int) -> None:
+    def begin(self, centers: Tensor, num_splats: int, pixels: int) -> None:
+        self.pixels = pixels
         if self.measure_by_cameras:
             spread = (centers - centers.mean(dim=0)).norm(dim=-1).max().item()
             self.state["scene_scale"] = EXTENT_MARGIN * spread or 1.0  # one camera has no extent
 
-    def pre_backward(self, step: int, info: Mapping[str, Any], opacities: Tensor, logits: Tensor) -> None:
+    def pre_backward(self, step: int, info: dict[str, Any], opacities: Tensor, logits: Tensor) -> None:
         super().pre_backward(step, info, opacities, logits)
         if step < self.strategy.refine_stop_iter:
             info["means2d"].retain_grad()
 
     def post_backward(self, step, info, splats, optimizers) -> None:
         strategy, self.shown = self.strategy, None
+        self.take_changes(info, len(splats["means"]))
         if step < strategy.refine_stop_iter:
             self._take_statistics(info, len(splats["means"]))
             if step == 0 and self.measure_by_cameras:
                 return
             if self._refines(step):
-                self._refine(step, splats, optimizers)
+                self._refine(step, info, splats, optimizers)
             if step % strategy.reset_every == 0:
                 reset_opa(splats, optimizers, self.state, value=2.0 * strategy.prune_opa)
         if step % strategy.reset_every == 0 or self._refines(step):
@@ -208,11 +206,19 @@ class GradientDensification(Densification):
                 state[name] = torch.zeros(count, device=gradients.device)
         take_statistics(state, info, gradients)
 
-    def _refine(self, step: int, splats, optimizers) -> None:
+    def _refine(self, step: int, info: Mapping[str, Any], splats, optimizers) -> None:
         """Grow and prune by gsplat's rules, and begin the statistics anew."""
         strategy, state = self.strategy, self.state
-        if self.budget:
-            strategy.grow_grad2d = self._threshold_for_budget(step, len(splats["means"]))
+        count, gradients = len(splats["means"]), state["grad2d"] / state["count"].clamp_min(1)
+        threshold = self._threshold_for_budget(step, count) if self.budget else self.threshold
+        strategy.grow_grad2d, strategy.grow_scale2d = threshold, self.widest
+        growing = gradients > threshold
+        if step < strategy.refine_scale2d_stop_iter:
+            growing |= state["radii"] > self.widest
+        wanted = int(growing.sum())
+        if (room := self.fitting(step, info, splats, optimizers, wanted)) < wanted:
+            largest = gradients.kthvalue(count - room).values.item()  # the threshold is exclusive
+            strategy.grow_grad2d, strategy.grow_scale2d = max(threshold, largest), math.inf
         duplicated, split = strategy._grow_gs(splats, optimizers, state, step)
         grown = len(splats["means"])
         pruned = 0

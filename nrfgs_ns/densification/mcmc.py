@@ -3,7 +3,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -75,26 +75,31 @@ class McmcDensification(Densification):
         self.config, self.budget, self.scene_unit = config, config.budget, scene_unit
         self.start, self.stop = config.warmup_length, config.stop_at
 
+    def rests_at(self, step: int) -> bool:
+        return step >= self.stop
+
     @torch.no_grad()
     def post_backward(self, step, info, splats, optimizers) -> None:
         self.shown = None
+        self.take_changes(info, len(splats["means"]))
         if step > self.start and step % self.config.refine_every == 0:
             if step < self.stop:
-                self._relocate_and_add(splats, optimizers)
+                self._relocate_and_add(step, info, splats, optimizers)
             self.begin_another_window()  # until the training's end, as the noise acts
         lr = float(optimizers["means"].param_groups[0]["lr"])
         size = NOISE_LR * lr / self.scene_unit**2  # times a covariance; lr is a length already
         # In every step: it must not take a splat for invisible because no view of this window has come by yet.
         add_noise(splats, size, self.seen_opacity(splats["opacities"]))
 
-    def _relocate_and_add(self, splats: Splats, optimizers: Optimizers) -> None:
+    def _relocate_and_add(self, step: int, info: Mapping[str, Any], splats: Splats, optimizers: Optimizers) -> None:
         """Move the dead and grow by 5 %. A new row has been changed by views as the splat that it was made from: its
         stored opacity is another, but the head would answer for it much as for that one."""
         dead = self.seen_opacity(splats["opacities"], before=False) <= MIN_OPACITY
         moved = relocate(splats, optimizers, dead, MIN_OPACITY)
         count = len(splats["means"])
-        goal = min(self.config.budget, int(1.05 * count))
-        added = add_samples(splats, optimizers, max(0, goal - count), MIN_OPACITY)
+        wanted = max(min(self.config.budget, int(1.05 * count)) - count, 0)
+        wanted = self.fitting(step, info, splats, optimizers, wanted)
+        added = add_samples(splats, optimizers, wanted, MIN_OPACITY)
         if self.state.get(CHANGE) is not None:
             self.state[CHANGE] = self.state[CHANGE][moved[added]]
 

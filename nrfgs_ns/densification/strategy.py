@@ -17,6 +17,7 @@ from torch.nn import Parameter
 from torch.optim import Optimizer
 
 from nrfgs_ns.data.checks import warn
+from nrfgs_ns.densification import memory
 from nrfgs_ns.errors import InputError
 
 OpacitySeen = Literal["base", "peak"]
@@ -31,6 +32,9 @@ CHANGE = "opacity_change"
 """Name, in a strategy's `state`, of the largest change of each splat's opacity by a view, [N]: see `change_of`."""
 CHANGE_BEFORE = CHANGE + "_before"
 """The same in the window before, for strategies that look at two (`begin_another_window`)."""
+HELD = "held_at"
+"""Name, in a strategy's `state`, of a pair: the number of splats at which memory has held growth, and the bytes of
+memory that there were; None: it was never short."""
 UNSEEN = -2.0
 """Change of a splat that no view has shown: less than any change."""
 
@@ -138,15 +142,17 @@ class Densification(ABC):
 
     name: str
     state: dict[str, Any]
-    """Numbers, tensors with a row per splat, or None for what the first step has to make."""
+    """Numbers, tuples of them, tensors with a row per splat, or None for what the first step has to make."""
     verbose: bool = True
     """Whether refinements are printed."""
     budget: int = 0
     """Number of splats to grow to; 0: as many as the rules give."""
+    pixels: int = 0
+    """Of the largest photograph."""
 
     def __init__(self, opacity_seen: OpacitySeen):
         self.opacity_seen = opacity_seen
-        self.state = {CHANGE: None} if opacity_seen == "peak" else {}
+        self.state = {HELD: None, **({CHANGE: None} if opacity_seen == "peak" else {})}
         self.shown: Shown | None = None
 
     def needs_absgrad(self, step: int) -> bool:
@@ -155,27 +161,29 @@ class Densification(ABC):
 
     moved_at: int | None = None
     """Last step at which rows of the table came to denote other splats although no tensor was replaced."""
-    takes_all_rows: bool = False
-    """Whether steps can be recorded: it ignores rows of radius 0 (invisible splats) and adds no term to the loss."""
 
     def rests_at(self, step: int) -> bool:
         """Whether it needs no gradients of this step; splats may still be replaced."""
         return False
 
-    def begin(self, centers: Tensor, num_splats: int) -> None:
+    def begin(self, centers: Tensor, num_splats: int, pixels: int) -> None:
         """Take what is known before the first step; warn where there are more splats than the budget of a strategy that
         removes none.
 
         Args:
             centers: of the training cameras, [V, 3].
             num_splats: splats that the training begins with.
+            pixels: of the largest photograph.
         """
+        self.pixels = pixels
         if self.verbose and 0 < self.budget < num_splats:
             fix = "With --pipeline.model.dense-start off it may begin with fewer."
             warn(f"The budget of {self.name} is {self.budget}, but the training begins with {num_splats} points. {fix}")
 
-    def pre_backward(self, step: int, info: Mapping[str, Any], opacities: Tensor, logits: Tensor) -> None:
-        """Look at a training view before the loss goes backward.
+    def pre_backward(self, step: int, info: dict[str, Any], opacities: Tensor, logits: Tensor) -> None:
+        """Look at a training view before the loss goes backward. A recorded step (`training/step_graph.py`) does so
+        once for all its steps, with a row for each splat, of radius 0 where it is not visible, and fills what is left
+        in `info` anew each time.
 
         Args:
             step: training step.
@@ -185,14 +193,41 @@ class Densification(ABC):
         """
         self.shown = Shown(info["gaussian_ids"], opacities, info.get("n_cameras", 1))
         if self.opacity_seen == "peak":
-            rows = info["gaussian_ids"]
-            if self.state[CHANGE] is None:
-                self.state[CHANGE] = logits.new_full((len(logits),), UNSEEN)
-            self.state[CHANGE].scatter_reduce_(0, rows, changes_shown(logits, rows, opacities), "amax")
+            changes = changes_shown(logits, info["gaussian_ids"], opacities)
+            info["change"] = torch.where(info["radii"] > 0, changes, UNSEEN)
 
     @abstractmethod
     def post_backward(self, step: int, info: Mapping[str, Any], splats: Splats, optimizers: Optimizers) -> None:
         """Change the table after the optimisers' step, given the `info` of `pre_backward` with gradients."""
+
+    def take_changes(self, info: Mapping[str, Any], count: int) -> None:
+        """Let the window's changes of opacity be at least those of a step."""
+        if self.opacity_seen == "peak":
+            if self.state[CHANGE] is None:
+                self.state[CHANGE] = torch.full((count,), UNSEEN, device=info["change"].device)
+            self.state[CHANGE].scatter_reduce_(0, info["gaussian_ids"], info["change"], "amax")
+
+    def fitting(self, step: int, info: Mapping[str, Any], splats: Splats, optimizers: Optimizers, wanted: int) -> int:
+        """How many of `wanted` more splats the GPU has memory for. Called in every refinement that may grow.
+
+        Where it is fewer, a line says so, and the number then reached is the training's limit: it is in checkpoints, so
+        that a continued training has the same, unless it has more memory, or less.
+        """
+        count, within = len(splats["means"]), self.least(memory.allowed(splats["means"].device))
+        if self.state[HELD] is None or self.state[HELD][1] != within:
+            later = max(self.pixels - info["width"] * info["height"], 0)
+            most = self.least(memory.most_splats(splats, optimizers, later))
+            if self.least(most - count - wanted) >= 0:
+                return wanted
+            self.state[HELD] = most, within
+            if self.verbose:
+                held = f"growth is held at {max(most, count):,} splats a GPU, since its memory has no room for more"
+                print(f"Step {step}: {held}. Smaller images or more GPUs make room (docs/troubleshooting.md).")
+        return min(wanted, max(self.state[HELD][0] - count, 0))
+
+    def least(self, number: int) -> int:
+        """The least of the devices' numbers; of one device its own."""
+        return number
 
     def mean_opacity(self, logits: Tensor) -> Tensor:
         """The splats' mean opacity for the loss, a scalar: as the step's cameras are shown them, stored otherwise.
@@ -205,7 +240,7 @@ class Densification(ABC):
         if self.shown is None:
             return torch.sigmoid(logits).mean()
         rows, opacities, cameras = self.shown
-        if cameras == 1 and len(rows) == len(logits):  # all are shown, or have a row (`takes_all_rows`)
+        if cameras == 1 and len(rows) == len(logits):  # all are shown, or have a row
             return opacities.mean()
         stored = torch.sigmoid(logits).flatten()
         # By index_select: the gradient of an index is a sort of all rows.

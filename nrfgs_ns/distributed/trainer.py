@@ -208,6 +208,8 @@ class ShardedTrainer(NrfgsTrainer):
         # Nerfstudio seeds devices differently, but initial splats and the order of the cameras must be the same.
         _set_random_seed(self.config.machine.seed)
         super().setup(test_mode)
+        if self.config.machine.device_type == "cuda":
+            CONSOLE.print("Steps are not recorded as a CUDA graph, so they take longer: there are several devices.")
 
     @property
     def _signal(self) -> int:

@@ -36,6 +36,14 @@ class Trimming(nn.Module):
         self.share = share
         self.register_buffer("histogram", torch.zeros(BINS))
 
+    def is_on(self, step: int) -> bool:
+        """Whether pixels are trimmed at a step of the schedule."""
+        return step >= FIRST_STEP
+
+    def fades_at(self, step: int) -> bool:
+        """Whether weights depend on the step."""
+        return FIRST_STEP <= step < FIRST_STEP + FADE_STEPS
+
     @torch.no_grad()
     def forward(self, prediction: Tensor, truth: Tensor, step: int, mask: Tensor | None = None) -> Tensor:
         """Weights [H, W, 1] of the pixels of images [H, W, 3] in [0, 1]; 1.0 is kept. Nothing waits for a GPU.

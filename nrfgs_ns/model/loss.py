@@ -7,7 +7,6 @@ from typing import Any
 
 from torch import Tensor
 
-from nrfgs_ns.image import robust
 from nrfgs_ns.image.ssim import photometric_loss
 
 
@@ -37,7 +36,7 @@ def photometric(model, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> 
     if "mask" in batch:  # pixels outside are black in both
         mask = model._downscale_if_required(batch["mask"]).to(model.device)
         truth, rgb = truth * mask, rgb * mask
-    if model.trimming is not None and model.training and model.schedule_step >= robust.FIRST_STEP:
+    if model.trimming is not None and model.training and model.trimming.is_on(model.schedule_step):
         kept = model.trimming(rgb, truth, model.schedule_step, mask)
         truth, rgb = truth * kept, rgb * kept
     return photometric_loss(rgb, truth, model.config.ssim_lambda)

@@ -247,7 +247,7 @@ class NrfgsModel(SplatfactoModel):
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
         cameras = attributes.pipeline.datamanager.train_dataset.cameras
         centers = cameras.camera_to_worlds[:, :3, 3]
-        self.densification.begin(centers, self.num_points)
+        self.densification.begin(centers, self.num_points, int((cameras.width * cameras.height).max()))
         self.camera_spacing = camera_spacing(centers)
         self.view_noise = ViewNoise(self.noise_factor * self.camera_spacing, self.view_noise.seed)
 

@@ -24,6 +24,7 @@ from torch.func import functional_call
 
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.data.checks import warn
+from nrfgs_ns.densification import memory
 from nrfgs_ns.image.metrics import WINDOW_SIZE
 from nrfgs_ns.model.loss import loss_of
 from nrfgs_ns.model.renderer import Pinhole, composite_view, project_view, render_view
@@ -33,7 +34,8 @@ MORE_ROOM = 1.5
 VIEWS_ASKED = 20
 """Views in which pairs are counted."""
 MOST_SIZES = 4
-"""Most sizes of photographs that are recorded; steps of further sizes run kernel by kernel."""
+"""Sizes of photographs that are recorded while splats grow, after each refinement anew. Later further sizes are, unless
+more than half of the GPU's memory is in use. Other steps run kernel by kernel."""
 
 
 class StepGraphs:
@@ -54,6 +56,8 @@ class StepGraphs:
         """what else differs between recordings: phases, places in memory, the resolution"""
         self._pairs_for_each = 0.0
         """the most pairs of a view, for each splat, at this resolution"""
+        self._place: tuple = ()
+        """a pool of memory and a stream, of all graphs"""
         self._given_up = False
         self._has_said_why = False
 
@@ -76,17 +80,19 @@ class StepGraphs:
         model = self.model
         exposed = model.photograph is not None
         obstacles = (
-            ("this densification needs the visible splats alone", not model.densification.takes_all_rows),
             ("exposures of transparent photographs are learnt", exposed and batch["image"].shape[-1] == 4),
-            ("the robust loss chooses pixels", model.trimming is not None),
+            ("the robust loss fades in", model.trimming is not None and model.trimming.fades_at(model.schedule_step)),
             ("camera poses are learnt", model.camera_optimizer.config.mode != "off"),
             ("the head's network sees pixels", model.head.at_pixel),
-            (
-                f"photographs have more than {MOST_SIZES} sizes, and only those of {MOST_SIZES} have a graph",
-                len(self._graphs) >= MOST_SIZES and _kind(batch) not in self._graphs,
-            ),
+            (f"photographs have many sizes; those of {len(self._graphs)} are recorded", self._is_one_too_many(batch)),
         )
         return next((what for what, there in obstacles if there), None)
+
+    def _is_one_too_many(self, batch: Mapping[str, Any]) -> bool:
+        """Whether the photograph is of a kind that has no graph and gets none."""
+        if len(self._graphs) < MOST_SIZES or _kind(batch) in self._graphs:
+            return False
+        return not self.model.densification.rests_at(self.model.step) or memory.share_used(self.model.device) > 0.5
 
     def prepare(self, camera: Cameras, batch: Mapping[str, Any], step: int) -> bool:
         """Whether `run` can make this step, which it is then ready for. False where the step is the first of its kind,
@@ -122,6 +128,7 @@ class StepGraphs:
             "places": [value.data_ptr() for value in splats],
             "head": model.head.phase,
             "densification": model.densification.rests_at(model.step),
+            "trims": model.trimming is not None and model.trimming.is_on(model.schedule_step),
             "downscale": model._get_downscale_factor(),
         }
         same = len(now) == len(self._of) and all(a is b for a, b in zip(now, self._of, strict=True))
@@ -144,7 +151,9 @@ class StepGraphs:
             if self._pairs_for_each == 0.0:
                 self._pairs_for_each = self._most_pairs() / self.model.num_points
             room = int(MORE_ROOM * self._pairs_for_each * self.model.num_points) + 1
-            graph = self._graphs[kind] = _StepGraph(self.model, seen_from, batch, room)
+            if not self._graphs:  # a pool's memory is free for others when all its graphs are gone
+                self._place = torch.cuda.graph_pool_handle(), torch.cuda.Stream(self.model.device)
+            graph = self._graphs[kind] = _StepGraph(self.model, seen_from, batch, room, self._place)
             graph.prepare(seen_from, batch, index, step)
         except Exception as error:
             self._given_up = True
@@ -189,9 +198,11 @@ class _StepGraph:
         model: an NrfgsModel in training.
         seen_from, batch: some camera, and its photograph and mask as the datamanager gives them.
         pairs: how many the lists have room for.
+        place: a pool of memory and a stream, for all graphs. What a graph needs only while it runs, others use again;
+            what it leaves lasts until the next one runs.
     """
 
-    def __init__(self, model, seen_from: Pinhole, batch: Mapping[str, Any], pairs: int):
+    def __init__(self, model, seen_from: Pinhole, batch: Mapping[str, Any], pairs: int, place: tuple):
         from nrfgs_ns.rasterizer.tile_lists import FixedRoom
 
         self.model, self.count = model, model.num_points
@@ -217,14 +228,18 @@ class _StepGraph:
         self.graph = torch.cuda.CUDAGraph()
         if self.noise is not None:
             self.graph.register_generator_state(self.noise)
-        now, aside = torch.cuda.current_stream(device), torch.cuda.Stream(device)
+        now, (pool, aside) = torch.cuda.current_stream(device), place
+        residuals = None if model.trimming is None else model.trimming.histogram.clone()
         aside.wait_stream(now)
         try:
             with torch.cuda.stream(aside):
                 self._compute()  # once outside the recording: first calls compile and allocate
                 for generator, state in zip(generators, states, strict=True):
                     generator.set_state(state)
-                self.graph.capture_begin(capture_error_mode="thread_local")  # a viewer has a thread of its own
+                if residuals is not None:
+                    model.trimming.histogram.copy_(residuals)
+                memory.give_back(device)
+                self.graph.capture_begin(pool, capture_error_mode="thread_local")  # a viewer has a thread of its own
                 try:
                     self._compute()
                 finally:

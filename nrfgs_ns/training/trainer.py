@@ -23,6 +23,7 @@ from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from nrfgs_ns.data.checks import warn
+from nrfgs_ns.densification.memory import give_back
 from nrfgs_ns.errors import ForTheUser, InputError
 from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.averaging import ParameterMean, window
@@ -101,6 +102,7 @@ class NrfgsTrainer(Trainer):
         """Add points from the photographs to those that a new training starts from."""
         if self.config.load_dir is None and self.config.load_checkpoint is None:
             notes = start_with_dense_points(self.pipeline.model, self.pipeline.datamanager)
+            torch.cuda.empty_cache()  # what a training holds tells how far it may grow; nothing without CUDA
             self.pipeline.notes = [*self.pipeline.notes, *notes]
 
     def setup_optimizers(self) -> Optimizers:
@@ -229,6 +231,9 @@ class NrfgsTrainer(Trainer):
         if self.line is not None and step_check(step, self.config.steps_per_eval_all_images):
             self.line.step_aside()  # the evaluation has a progress bar of its own
         super().eval_iteration(step)
+        intervals = self.config.steps_per_eval_image, self.config.steps_per_eval_all_images
+        if any(step_check(step, steps) for steps in intervals):
+            give_back(self.pipeline.model.device)
 
     def train_iteration(self, step: int):
         """One step; TrainingStopped where it, or on a GPU the one before, met a number that is not finite."""

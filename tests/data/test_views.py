@@ -152,8 +152,9 @@ def test_a_step_without_auto_scaling_is_the_same_in_any_unit(strategy, factor, t
     if strategy == "mcmc":
         for trainer, densification in zip((base, other), densifications, strict=True):
             torch.manual_seed(3)
-            trainer.pipeline.model.gauss_params["opacities"].data.fill_(-12.0)  # what cannot be seen explores
-            densification.post_backward(1, {}, trainer.pipeline.model.gauss_params, trainer.optimizers.optimizers)
+            model = trainer.pipeline.model
+            model.gauss_params["opacities"].data.fill_(-12.0)  # what cannot be seen explores
+            densification.post_backward(1, model.info, model.gauss_params, trainer.optimizers.optimizers)
         assert (ours["means"] - theirs["means"] * factor).abs().max() < 1e-5 * factor * theirs["means"].abs().max()
         penalties = [
             d.regularisation(t.pipeline.model.gauss_params) for d, t in zip(densifications, (base, other), strict=True)

@@ -11,6 +11,7 @@ from short_trainings import command_line, set_up
 from torch.nn import Parameter
 
 from nrfgs_ns.densification import STRATEGIES as CONFIGS
+from nrfgs_ns.densification import UNSEEN
 
 STRATEGIES = ("splatfacto", "original", "mcmc")
 REFINES = 1000
@@ -73,7 +74,10 @@ class Table:
         logits = self.splats["opacities"]
         stored = torch.sigmoid(logits.detach().index_select(0, rows)).squeeze(-1)
         opacities = shown(stored) if callable(shown) else torch.full_like(stored, shown)
-        strategy.pre_backward(step, {**info, "gaussian_ids": rows}, opacities, logits)
+        view = {**info, "gaussian_ids": rows, "radii": info["radii"][rows]}
+        strategy.pre_backward(step, view, opacities, logits)
+        if "change" in view:
+            info["change"] = torch.full((len(self),), UNSEEN).index_copy(0, rows, view["change"])
         strategy.post_backward(step, info, self.splats, self.optimizers)
 
     def check(self) -> None:

@@ -10,6 +10,7 @@ from torch.testing import assert_close
 
 from nrfgs_ns.densification import CHANGE, ErrorGuided
 from nrfgs_ns.densification.error_guided import DECAY, ERROR, SHARE, WIDTH, draw, split
+from nrfgs_ns.densification.strategy import HELD
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.rasterizer import composite, project
 
@@ -147,7 +148,7 @@ def test_a_share_of_the_candidates_is_split_and_the_dead_are_replaced():
     assert len(table) == 40 + round(SHARE * 20) - 4
     assert set(table.splats["latents"][:4, 0].long().tolist()) <= set(range(4, 40))
     assert strategy.moved_at == 600, "rows denote other splats, and a mean over steps must know"
-    assert all(len(value) == len(table) for value in strategy.state.values())
+    assert all(len(value) == len(table) for name, value in strategy.state.items() if name != HELD)
 
 
 def test_the_shown_opacity_decides_what_is_dead():
@@ -206,7 +207,7 @@ def test_growth_ends_at_the_cap_and_in_time():
 def test_a_budget_below_the_start_is_told(capsys):
     strategy = rules(budget=5)
     strategy.verbose = True
-    strategy.begin(torch.zeros(3, 3), 5)
+    strategy.begin(torch.zeros(3, 3), 5, 1)
     assert capsys.readouterr().out == ""
-    strategy.begin(torch.zeros(3, 3), 6)
+    strategy.begin(torch.zeros(3, 3), 6, 1)
     assert "budget of error-guided is 5, but the training begins with 6" in " ".join(capsys.readouterr().out.split())

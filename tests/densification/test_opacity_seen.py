@@ -67,7 +67,9 @@ def test_heads_of_stored_opacity_change_nothing(config):
     splats = {"means": torch.randn(37, 3), "opacities": logits, **head.splat_params(torch.rand(37, 3))}
     rows = torch.randperm(37)[:21]
     rules = strategy("mcmc")
-    rules.pre_backward(0, {"gaussian_ids": rows}, head(splats, rows, torch.zeros(3)).opacities, logits)
+    info = {"gaussian_ids": rows, "radii": torch.ones(21)}
+    rules.pre_backward(0, info, head(splats, rows, torch.zeros(3)).opacities, logits)
+    rules.take_changes(info, 37)
     assert (rules.state[CHANGE][rows] == 0.0).all() and (rules.state[CHANGE] == UNSEEN).sum() == 16
 
 
@@ -179,8 +181,8 @@ def test_mean_opacity_in_the_loss_is_that_of_what_is_shown():
     splats = {"opacities": logits, "scales": torch.zeros(4, 3, dtype=torch.float64)}
     assert_close(rules.regularisation(splats)["mcmc_opacity_reg"], 0.01 * stored.mean())
     shown = torch.tensor([0.5, 0.6, 0.7], dtype=torch.float64, requires_grad=True)
-    info = {"gaussian_ids": torch.tensor([0, 2, 2]), "n_cameras": 2}  # the first camera sees 0 and 2, the second 2
-    rules.pre_backward(0, info, shown, logits)
+    info = {"gaussian_ids": torch.tensor([0, 2, 2]), "radii": torch.ones(3), "n_cameras": 2}
+    rules.pre_backward(0, info, shown, logits)  # the first camera sees 0 and 2, the second 2
     term = rules.regularisation(splats)["mcmc_opacity_reg"]
     first, second = [0.5, 0.2, 0.6, 0.4], [0.1, 0.2, 0.7, 0.4]
     assert_close(term.item(), 0.01 * (sum(first) + sum(second)) / 8)
@@ -189,7 +191,8 @@ def test_mean_opacity_in_the_loss_is_that_of_what_is_shown():
     kept = torch.tensor([1, 2, 0, 2], dtype=torch.float64)  # cameras that do not show it
     assert_close(by_logit[:, 0], 0.01 / 8 * kept * stored * (1 - stored))
     shown = torch.tensor([0.5, 0.6, 0.7, 0.8], dtype=torch.float64, requires_grad=True)
-    rules.pre_backward(0, {"gaussian_ids": torch.arange(4)}, shown, logits)  # one camera shows all
+    info = {"gaussian_ids": torch.arange(4), "radii": torch.ones(4)}
+    rules.pre_backward(0, info, shown, logits)  # one camera shows all
     term = rules.regularisation(splats)["mcmc_opacity_reg"]
     assert_close(term.item(), 0.01 * 0.65)
     assert_close(torch.autograd.grad(term, shown)[0], torch.full_like(shown, 0.01 / 4))

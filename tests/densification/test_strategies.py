@@ -74,14 +74,14 @@ def test_mcmc_rests_before_its_start_and_after_its_end():
 def test_original_measures_by_the_cameras():
     """3DGS: 1.1 times the largest distance of a camera from the mean of all."""
     rules = strategy("original")
-    rules.begin(torch.tensor([[0.0, 0, 0], [4.0, 0, 0], [2.0, 3.0, 0.0], [2.0, -3.0, 0.0]]), 4)
+    rules.begin(torch.tensor([[0.0, 0, 0], [4.0, 0, 0], [2.0, 3.0, 0.0], [2.0, -3.0, 0.0]]), 4, 1)
     assert rules.state["scene_scale"] == pytest.approx(1.1 * 3.0)
     table = Table(4, scale=0.032)  # 0.01 x 3.3 = 0.033: three are duplicated, the last is split
     table.splats["scales"].data[3] = torch.tensor(0.034).log()
     table.step(rules, REFINES, gradient=1.0)
     kept = torch.bincount(table.splats["scales"].exp().amax(dim=-1).mul(1000).round().long())
     assert kept[32] == 6 and kept[round(34 / 1.6)] == 2
-    rules.begin(torch.ones(1, 3), 4)
+    rules.begin(torch.ones(1, 3), 4, 1)
     assert rules.state["scene_scale"] == 1.0
 
 

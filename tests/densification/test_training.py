@@ -8,7 +8,8 @@ from densification_cases import arguments, trainer_of
 from short_trainings import assert_same_training, checkpoint_of, models_of, set_up
 
 from nrfgs_lab.training_run import train
-from nrfgs_ns.densification import CHANGE, UNSEEN
+from nrfgs_ns.densification import CHANGE, UNSEEN, memory
+from nrfgs_ns.densification.strategy import HELD
 from nrfgs_ns.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -63,6 +64,23 @@ def test_resumed_training_is_the_unbroken_one(densification, seen, tiny_scene, t
     if seen == "peak":
         assert strategy[CHANGE].max() > UNSEEN
     assert_same_training(whole, rest, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("densification", ["splatfacto", "mcmc", "error-guided"])
+def test_growth_that_memory_holds_is_held_in_a_continued_training(densification, tiny_scene, tmp_path, monkeypatch):
+    """Whatever memory there seems to be then: it is measured otherwise in another process."""
+    measured = iter([310])
+    monkeypatch.setattr(memory, "most_splats", lambda *_: next(measured, 10**6))
+
+    def run(name: str, steps: int, *more: str) -> dict:
+        config = Path(train([*arguments(tiny_scene, tmp_path / name, densification, steps), *more]).config_path)
+        return checkpoint_of(config) | {"folder": models_of(config)}
+
+    half = run("half", 14)
+    rest, measured = run("rest", 26, "--load-dir", str(half["folder"])), iter([310])
+    assert_same_training(run("whole", 26), rest, rtol=0, atol=0)
+    assert 300 <= len(rest["pipeline"]["_model.gauss_params.means"]) <= 310
+    assert rest["pipeline"]["_model._extra_state"]["strategy"][HELD] == (310, 0)
 
 
 def test_another_strategies_checkpoint_is_refused(tiny_scene, tmp_path):

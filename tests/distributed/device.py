@@ -145,6 +145,7 @@ def statistics(model, info) -> dict:
     from nrfgs_ns.densification.gradient import GradientDensification
 
     rules = model.densification
+    rules.take_changes(info, model.num_points)
     if isinstance(rules, GradientDensification):
         if rules.state["count"] is None:  # gsplat adds ones of float32, whatever the default
             rules.state["count"] = torch.zeros(model.num_points, dtype=torch.float32, device=model.device)

@@ -31,6 +31,7 @@ def everything(scene: Path, folder: Path) -> None:
     fifty_steps(scene, folder)
     there_and_back(scene, folder)
     stops_together(scene, folder)
+    held_together(scene, folder)
     averaged(scene, folder)
 
 
@@ -127,6 +128,25 @@ def stops_together(scene: Path, folder: Path) -> None:
     except TrainingStopped as stopped:
         said = str(stopped)
     torch.save(said, folder / f"stopped-{dist.get_rank()}.pt")
+
+
+def held_together(scene: Path, folder: Path) -> None:
+    """The second device has memory for no more splats than it has."""
+    from nrfgs_ns.densification import memory
+
+    of_one, counts = memory.most_splats, []
+
+    def limit(trainer) -> None:
+        model = trainer.pipeline.model
+        memory.most_splats = lambda *_: model.num_points if dist.get_rank() else 10**6
+        after_each(trainer, lambda step: counts.append(model.num_points))
+
+    try:
+        trainer = train(scene, folder / "held", dist.get_world_size(), 10, watch=limit, **BY_ERROR)
+    finally:
+        memory.most_splats = of_one
+    held = trainer.pipeline.model.densification.state["held_at"]
+    torch.save({"counts": counts, "held": held}, folder / f"held-{dist.get_rank()}.pt")
 
 
 def averaged(scene: Path, folder: Path) -> None:

@@ -99,6 +99,13 @@ def test_one_device_s_nan_stops_all_with_its_message(two_devices):
     assert all(torch.isfinite(value).all() for value in splats_of(content).values())
 
 
+def test_memory_that_one_device_lacks_holds_growth_on_all(two_devices):
+    first, second = (torch.load(two_devices / f"held-{rank}.pt") for rank in (0, 1))
+    assert first["held"] == second["held"] == (second["counts"][0], 0)
+    for device in (first, second):
+        assert max(device["counts"]) == device["counts"][0]
+
+
 SPLATS = "gauss_params."
 
 

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How many splats a GPU has memory for."""
+
+import sys
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+
+SHARE = 0.9
+"""Share of the memory that growth may fill: it is not in one piece, and views differ."""
+PLENTY = 0.25
+"""Share of the memory up to which splats may be doubled whatever it holds."""
+BYTES_PER_PIXEL = 200
+"""What a step holds of a pixel: the image, the photograph and SSIM's means of both, with their gradients."""
+
+
+def allowed(device: torch.device) -> int:
+    """Bytes of a GPU that this process may take; 0 on a CPU."""
+    if device.type != "cuda":
+        return 0
+    # torch < 2.8 does not say what `set_per_process_memory_fraction` was given.
+    share = getattr(torch.cuda, "get_per_process_memory_fraction", lambda _: 1.0)(device)
+    return int(share * torch.cuda.get_device_properties(device).total_memory)
+
+
+def most_splats(splats: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer], later_pixels: int) -> int:
+    """The most splats that a refinement may grow to; no limit on a CPU, and where there are none yet.
+
+    Each will take what each takes now, in parameters, gradients, moments and a step's other tensors and lists. Besides,
+    while rows are added, parameters and moments are there twice.
+
+    Args:
+        splats, optimizers: as in `Densification.post_backward`.
+        later_pixels: by which the largest image of the training is larger than the present ones.
+    """
+    device, count = splats["means"].device, len(splats["means"])
+    if device.type != "cuda" or count == 0:
+        return sys.maxsize
+    moments = [value for name in splats for value in optimizers[name].state.get(splats[name], {}).values()]
+    parameters = sum(value.nbytes for value in splats.values())
+    copied = parameters + sum(value.nbytes for value in moments if value.dim() > 0)
+    # What does not grow: photographs, for the most part.
+    fixed = max(torch.cuda.memory_allocated(device) - copied - parameters, 0)
+    held, (free, _) = torch.cuda.memory_reserved(device), torch.cuda.mem_get_info(device)
+    room = SHARE * min(held + free, allowed(device)) - fixed - BYTES_PER_PIXEL * later_pixels
+    return max(int(count * room / (held - fixed + copied)), 0)
+
+
+def share_used(device: torch.device) -> float:
+    """Share of a GPU's memory that torch has; 0 on a CPU."""
+    return torch.cuda.memory_reserved(device) / allowed(device) if device.type == "cuda" else 0.0
+
+
+def give_back(device: torch.device) -> None:
+    """Give back what torch keeps of a GPU for later: `most_splats` counts it as in use, and a graph that is being
+    recorded does not get it. Nothing where memory is plentiful, since it costs time to get it again."""
+    if share_used(device) > PLENTY:
+        torch.cuda.empty_cache()

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Growth ends before a GPU's memory does: by fake readings, and with `-m gpu` in a process that may take little."""
+
+import re
+import sys
+from types import SimpleNamespace
+
+import pytest
+import torch
+from densification_cases import REFINES, Table, arguments, strategy
+from short_trainings import set_up
+
+from nrfgs_ns.densification import STRATEGIES, memory
+from nrfgs_ns.densification.strategy import HELD
+
+GB = 10**9
+OPTIONS = {"error-guided": {"threshold": 1e-4}}
+
+
+class Rows(SimpleNamespace):
+    """A table's tensor, or moment, of a card."""
+
+    device, dim, __hash__ = torch.device("cuda"), lambda self: 2, object.__hash__
+
+    def __len__(self) -> int:
+        return 1000
+
+
+def card(monkeypatch, share: float, free: float, reserved: float, allocated: float) -> None:
+    """Let torch tell this of a card of 24 GB; sizes in GB."""
+    readings = {
+        "memory_reserved": int(reserved * GB),
+        "memory_allocated": int(allocated * GB),
+        "mem_get_info": (int(free * GB), 24 * GB),
+        "get_per_process_memory_fraction": share,
+        "get_device_properties": SimpleNamespace(total_memory=24 * GB),
+    }
+    for name, value in readings.items():
+        monkeypatch.setattr(torch.cuda, name, lambda device, value=value: value, raising=False)
+
+
+@pytest.mark.parametrize("share, free, limit", [(1.0, 17, 24), (0.5, 17, 12), (1.0, 2, 9)])
+def test_the_estimate(share, free, limit, monkeypatch):
+    """1,000 splats, with parameters and gradients of 1 GB each and moments of 2, and photographs of 1 GB, hold 7 GB."""
+    card(monkeypatch, share, free, reserved=7, allocated=5)
+    splats = {"means": Rows(nbytes=GB)}
+    moments = {"exp_avg": Rows(nbytes=GB), "exp_avg_sq": Rows(nbytes=GB), "step": torch.ones(())}
+    optimizers = {"means": SimpleNamespace(state={splats["means"]: moments})}
+    # Each takes 6 MB in a step, and 3 MB twice while others are added.
+    most = memory.most_splats(splats, optimizers, 0)
+    assert most == pytest.approx((0.9 * limit - 1) / 0.009, abs=1)
+    assert memory.most_splats(splats, optimizers, 10**7) == pytest.approx((0.9 * limit - 3) / 0.009, abs=1)
+    assert most * 0.009 + 1 <= limit
+
+
+def test_a_cpu_is_not_asked(monkeypatch):
+    table = Table(3)
+    monkeypatch.setattr(torch, "cuda", None)
+    assert memory.most_splats(table.splats, table.optimizers, 0) == sys.maxsize
+    assert memory.allowed(torch.device("cpu")) == 0
+    memory.give_back(torch.device("cpu"))
+
+
+@pytest.mark.parametrize("reserved, times", [(2, 0), (4, 1)])
+def test_memory_is_given_back_where_it_may_be_short(reserved, times, monkeypatch):
+    calls = []
+    card(monkeypatch, 0.5, 10, reserved, reserved)
+    monkeypatch.setattr(torch.cuda, "empty_cache", lambda: calls.append(1))
+    memory.give_back(torch.device("cuda"))
+    assert len(calls) == times
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_growth_ends_where_memory_does(name, monkeypatch, capsys):
+    """And for good, in a continued training too, unless that has another memory."""
+    monkeypatch.setattr(memory, "most_splats", lambda *_: 41)
+    table, rules = Table(40), strategy(name, opacity_seen="base", **OPTIONS.get(name, {}))
+    torch.manual_seed(0)
+    table.step(rules, REFINES, gradient=1.0)
+    held = 40 if name in ("splatfacto", "original") else 41  # of equal gradients all grow, or none
+    assert len(table) == held
+    monkeypatch.setattr(memory, "most_splats", lambda *_: 1000)
+    resumed = strategy(name, opacity_seen="base", **OPTIONS.get(name, {}))
+    resumed.load_state(rules.state, torch.device("cpu"))
+    for followed in (rules, resumed):
+        table.step(followed, REFINES + 200, gradient=1.0)
+        table.check()
+        assert len(table) == held
+    lines = [line for line in capsys.readouterr().out.splitlines() if "memory" in line]
+    assert lines == [
+        f"Step {REFINES}: growth is held at 41 splats a GPU, since its memory has no room for more. Smaller images or "
+        "more GPUs make room (docs/troubleshooting.md)."
+    ]
+    monkeypatch.setattr(memory, "allowed", lambda device: 24 * GB)
+    table.step(resumed, REFINES + 400, gradient=1.0)
+    assert len(table) > 41
+
+
+@pytest.mark.parametrize("name", ["splatfacto", "original"])
+def test_the_largest_gradients_grow(name, monkeypatch):
+    """Splats that are wide in the image, but not by gradient, do not."""
+    monkeypatch.setattr(memory, "most_splats", lambda *_: 43)
+    table, rules = Table(40), strategy(name)
+    info = table.info(1.0)
+    info["means2d"].absgrad = info["means2d"].grad = info["means2d"].grad * torch.arange(40)[:, None]
+    info["radii"][:20] = 9
+    rules.pre_backward(REFINES, info, torch.full((40,), 0.5), table.splats["opacities"])
+    rules.post_backward(REFINES, info, table.splats, table.optimizers)
+    table.check()
+    latents = table.splats["latents"][:, 0].round().sort().values.tolist()
+    assert latents == sorted([*range(40), 37, 38, 39])
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_growth_is_held_in_a_small_share_of_a_card(name, tiny_scene, tmp_path, capsys):
+    """A training that would grow without end ends well."""
+    options = {
+        "splatfacto": {"densify_grad_thresh": 0.0},
+        "mcmc": {"budget": 2**24, "refine_every": 2},  # grows by 5 % at most
+        "error-guided": {"budget": 10**7, "most_splats": 10**7},
+    }
+    args = arguments(tiny_scene, tmp_path, name, 800, **options.get(name, {}))
+    trainer = set_up(args)
+    if name == "original":
+        trainer.pipeline.model.densification.threshold = 0.0
+    torch.cuda.empty_cache()
+    total = torch.cuda.get_device_properties(0).total_memory
+    torch.cuda.set_per_process_memory_fraction((torch.cuda.memory_reserved() + 300e6) / total)
+    try:
+        trainer.train()
+        held, within = trainer.pipeline.model.densification.state[HELD]
+        assert within < total and held > 10_000
+    finally:
+        torch.cuda.set_per_process_memory_fraction(1.0)
+    (at,) = re.findall(r"growth is held at ([\d,]+) splats", capsys.readouterr().out)
+    assert held <= int(at.replace(",", "")) and trainer.pipeline.model.num_points <= int(at.replace(",", ""))
