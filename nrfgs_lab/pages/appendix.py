@@ -61,8 +61,10 @@ def default() -> str:
     for scene, views in VIEWS.items():
         for label, runs in (("field", today(scene, FIELD)), ("harmonics", today(scene, SAME))):
             seeds = ", ".join(f"{one['psnr']:.2f}" for one in runs)
-            metrics = [metric for metric in ("ssim", "ms_ssim", "flip") if all(metric in one for one in runs)]
-            means = [f"{mean(runs, metric):.3f}" for metric in metrics] + ["-"] * (3 - len(metrics))
+            means = [
+                f"{mean(runs, metric):.3f}" if all(metric in one for one in runs) else "-"
+                for metric in ("ssim", "ms_ssim", "flip")
+            ]
             middle = fmean(median(view[1] for view in one["per_image"]) for one in runs)
             worst = min(view[1] for one in runs for view in one["per_image"])
             gap = mean(runs, "train_psnr") - mean(runs, "psnr")

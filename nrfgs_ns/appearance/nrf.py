@@ -62,14 +62,15 @@ class NrfConfig(AppearanceHeadConfig):
     color_scale: float = 0.2
     """s_c: largest change of a colour channel, in units of white"""
     opacity_scale: float = 0.2
-    """s_alpha: largest change of opacity; where `opacity_bound` is not given, twice this on the logit"""
+    """s_alpha: largest change of opacity; with error-guided and mcmc twice this, unless `opacity_bound` is given"""
     distance_eps: float = NEAREST
     """smallest camera distance, in scene units; shorter ones count as this. The near plane"""
     output_init: Literal["zero", "default"] = "zero"
     """start of the output layers. zero: no residual. default: torch's, as in the paper, followed by the warm-up"""
     opacity_bound: OpacityBound | None = None
     """how base + residual stays in [0, 1] (docs/deviations.md). straight-through: clamped, but the gradient ignores the
-    clamp. logit: the residual is added to the logit. None: logit for error-guided and mcmc"""
+    clamp. logit: the residual is added to the logit. None: logit for error-guided and mcmc, which make splats share
+    their opacity, otherwise straight-through"""
     implementation: Literal["auto", "torch", "fused"] = "auto"
     """auto: fused Triton kernels on CUDA where they can run, PyTorch elsewhere. fused: an error instead of PyTorch"""
     precision: Literal["fp32", "tf32", "bf16", "fp16"] = "bf16"

@@ -11,7 +11,7 @@ from torch.optim import Optimizer
 SHARE = 0.9
 """Share of the memory that growth may fill: it is not in one piece, and views differ."""
 PLENTY = 0.25
-"""Share of the memory up to which splats may be doubled whatever it holds."""
+"""Share of the memory up to which torch may keep what it does not use."""
 BYTES_PER_PIXEL = 200
 """What a step holds of a pixel: the image, the photograph and SSIM's means of both, with their gradients."""
 
@@ -41,16 +41,22 @@ def most_splats(splats: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer
     moments = [value for name in splats for value in optimizers[name].state.get(splats[name], {}).values()]
     parameters = sum(value.nbytes for value in splats.values())
     copied = parameters + sum(value.nbytes for value in moments if value.dim() > 0)
-    # What does not grow: photographs, for the most part.
+    # Counted as what does not grow: photographs, for the most part; also what several graphs leave.
     fixed = max(torch.cuda.memory_allocated(device) - copied - parameters, 0)
-    held, (free, _) = torch.cuda.memory_reserved(device), torch.cuda.mem_get_info(device)
-    room = SHARE * min(held + free, allowed(device)) - fixed - BYTES_PER_PIXEL * later_pixels
+    held = torch.cuda.memory_reserved(device)
+    room = SHARE * available(device) - fixed - BYTES_PER_PIXEL * later_pixels
     return max(int(count * room / (held - fixed + copied)), 0)
 
 
+def available(device: torch.device) -> int:
+    """Bytes of a GPU that this process has or may get, beside what other processes have."""
+    free, _ = torch.cuda.mem_get_info(device)
+    return min(torch.cuda.memory_reserved(device) + free, allowed(device))
+
+
 def share_used(device: torch.device) -> float:
-    """Share of a GPU's memory that torch has; 0 on a CPU."""
-    return torch.cuda.memory_reserved(device) / allowed(device) if device.type == "cuda" else 0.0
+    """Share that torch has of a GPU's available memory; 0 on a CPU."""
+    return torch.cuda.memory_reserved(device) / available(device) if device.type == "cuda" else 0.0
 
 
 def give_back(device: torch.device) -> None:

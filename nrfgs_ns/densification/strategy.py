@@ -219,9 +219,10 @@ class Densification(ABC):
             most = self.least(memory.most_splats(splats, optimizers, later))
             if self.least(most - count - wanted) >= 0:
                 return wanted
+            most = max(most, -self.least(-count))  # the most that a device has
             self.state[HELD] = most, within
             if self.verbose:
-                held = f"growth is held at {max(most, count):,} splats a GPU, since its memory has no room for more"
+                held = f"growth is held at {most:,} splats a GPU, since its memory has no room for more"
                 print(f"Step {step}: {held}. Smaller images or more GPUs make room (docs/troubleshooting.md).")
         return min(wanted, max(self.state[HELD][0] - count, 0))
 

@@ -107,8 +107,9 @@ class NrfgsModel(SplatfactoModel):
         return self.config.view_noise / self.trust
 
     @property
-    def reduced_head(self) -> dict[str, Any]:
-        """Options of the head that a checkpoint or the number of views has set, not the configuration."""
+    def suited_head(self) -> dict[str, Any]:
+        """Options of the head that a checkpoint, the number of views or the densification has set, not the
+        configuration."""
         return differences(self.config.appearance, self.head.config)
 
     def _initial_splats(self) -> dict[str, Tensor]:
@@ -428,8 +429,8 @@ class NrfgsModel(SplatfactoModel):
             "views": self.num_views,
             "near": self.near,
         }
-        if reduced := self.reduced_head:
-            state["capacity"] = {"head": reduced}
+        if suited := self.suited_head:
+            state["capacity"] = {"head": suited}
         return state if self._scheduled is None else {**state, "schedule_step": self._scheduled}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:

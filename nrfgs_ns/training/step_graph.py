@@ -59,18 +59,20 @@ class StepGraphs:
         self._place: tuple = ()
         """a pool of memory and a stream, of all graphs"""
         self._given_up = False
-        self._has_said_why = False
+        self._said: set[str] = set()
+        """what has been reported"""
 
     def _takes(self, batch: Mapping[str, Any]) -> bool:
-        """Whether this step can be recorded; what prevents it is reported once."""
+        """Whether this step can be recorded; each thing that prevents it is reported once."""
         model = self.model
         if self._given_up or model.device.type != "cuda" or model.num_points == 0:
             return False
         if (obstacle := self._obstacle(batch)) is not None:
-            if not self._has_said_why:
+            self._is_new()  # graphs of splats that are gone would keep their memory
+            if obstacle not in self._said:
                 why = f"Steps are not recorded as a CUDA graph, so they take longer: {obstacle}."
                 CONSOLE.print(why, soft_wrap=True)
-                self._has_said_why = True
+                self._said.add(obstacle)
             return False
         # Smaller images go to pytorch_msssim, which copies its window from the host.
         return min(batch["image"].shape[:2]) // model._get_downscale_factor() >= WINDOW_SIZE
@@ -84,7 +86,7 @@ class StepGraphs:
             ("the robust loss fades in", model.trimming is not None and model.trimming.fades_at(model.schedule_step)),
             ("camera poses are learnt", model.camera_optimizer.config.mode != "off"),
             ("the head's network sees pixels", model.head.at_pixel),
-            (f"photographs have many sizes; those of {len(self._graphs)} are recorded", self._is_one_too_many(batch)),
+            ("photographs have many sizes, and only some of them are recorded", self._is_one_too_many(batch)),
         )
         return next((what for what, there in obstacles if there), None)
 

@@ -180,8 +180,10 @@ def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool)
     if model.trust < FEW:
         parts.append("view dependence reduced, as suits few views")
     if model.trust < 1.0:
-        reduced = ", ".join(f"{name} {value}" for name, value in (model.reduced_head or {}).items())
-        notes.append(f"trust in view dependence: {model.trust:.2g} of 1{f' ({reduced})' if reduced else ''}")
+        notes.append(f"trust in view dependence: {model.trust:.2g} of 1")
+    if suited := model.suited_head:
+        chosen = (f"{name} {round(value, 3) if isinstance(value, float) else value}" for name, value in suited.items())
+        notes.append(f"head, by views and densification: {', '.join(chosen)}")
     if model.view_noise.sigma > 0.0:
         offset = model.noise_factor * model.camera_spacing / model.scene_unit
         notes.append(

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Growth ends before a GPU's memory does: by fake readings, and with `-m gpu` in a process that may take little."""
 
-import re
 import sys
 from types import SimpleNamespace
 
@@ -112,6 +111,9 @@ def test_the_largest_gradients_grow(name, monkeypatch):
 
 
 @pytest.mark.gpu
+@pytest.mark.skipif(
+    not hasattr(torch.cuda, "get_per_process_memory_fraction"), reason="torch < 2.8 tells no process its share"
+)
 @pytest.mark.parametrize("name", STRATEGIES)
 def test_growth_is_held_in_a_small_share_of_a_card(name, tiny_scene, tmp_path, capsys):
     """A training that would grow without end ends well."""
@@ -133,5 +135,5 @@ def test_growth_is_held_in_a_small_share_of_a_card(name, tiny_scene, tmp_path, c
         assert within < total and held > 10_000
     finally:
         torch.cuda.set_per_process_memory_fraction(1.0)
-    (at,) = re.findall(r"growth is held at ([\d,]+) splats", capsys.readouterr().out)
-    assert held <= int(at.replace(",", "")) and trainer.pipeline.model.num_points <= int(at.replace(",", ""))
+    assert trainer.pipeline.model.num_points <= held
+    assert capsys.readouterr().out.count(f"growth is held at {held:,} splats") == 1

@@ -41,11 +41,11 @@ def test_a_photograph_of_one_size_too_many_has_no_graph_and_it_is_said(build, mo
     assert graphs._obstacle({"image": torch.zeros(5, 4, 3)}) is None
     graphs._graphs = {((height, 4, 3), False): None for height in range(5, 5 + MOST_SIZES)}
     assert graphs._obstacle({"image": torch.zeros(5, 4, 3)}) is None
-    assert "those of 4 are recorded" in graphs._obstacle({"image": torch.zeros(4, 4, 3)})
+    assert "many sizes" in graphs._obstacle({"image": torch.zeros(4, 4, 3)})
     pipeline.model.step = 29_000  # growth has ended
     assert graphs._obstacle({"image": torch.zeros(4, 4, 3)}) is None
     monkeypatch.setattr(memory, "share_used", lambda device: 0.6)
-    assert "those of 4 are recorded" in graphs._obstacle({"image": torch.zeros(4, 4, 3)})
+    assert "many sizes" in graphs._obstacle({"image": torch.zeros(4, 4, 3)})
 
 
 def begin(pipeline, step: int) -> None:
