@@ -69,8 +69,7 @@ class NrfConfig(AppearanceHeadConfig):
     """start of the output layers. zero: no residual. default: torch's, as in the paper, followed by the warm-up"""
     opacity_bound: OpacityBound | None = None
     """how base + residual stays in [0, 1] (docs/deviations.md). straight-through: clamped, but the gradient ignores the
-    clamp. logit: the residual is added to the logit. None: logit for error-guided and mcmc, which make splats share
-    their opacity, otherwise straight-through"""
+    clamp. logit: added to the logit. None: logit for error-guided and mcmc, otherwise straight-through"""
     implementation: Literal["auto", "torch", "fused"] = "auto"
     """auto: fused Triton kernels on CUDA where they can run, PyTorch elsewhere. fused: an error instead of PyTorch"""
     precision: Literal["fp32", "tf32", "bf16", "fp16"] = "bf16"
@@ -86,11 +85,9 @@ class NrfConfig(AppearanceHeadConfig):
         return replace(self, opacity_scale=share * self.opacity_scale) if self.opacity_residual else self
 
     def for_copies(self) -> "NrfConfig":
-        """By default twice the residual, on the logit: n copies of a splat would each add a whole one to their opacity,
-        and one in which a view sees nothing would be seen by others."""
-        if self.opacity_bound or not self.opacity_residual:
-            return self
-        return replace(self, opacity_bound="logit", opacity_scale=2 * self.opacity_scale)
+        """By default twice the residual, on the logit: each part of a splat would add a whole one to its opacity."""
+        on_logit = {"opacity_bound": "logit", "opacity_scale": 2 * self.opacity_scale}
+        return self if self.opacity_bound or not self.opacity_residual else replace(self, **on_logit)
 
     def validate(self) -> None:
         self.require(1 <= self.latent_dim <= 1024, "latent_dim", "from 1 to 1024")

@@ -172,8 +172,7 @@ class ErrorGuidedDensification(Densification):
         grown = parents[:0]
         if step < self.grow_until:
             weights, wanted = self._candidates(step, count, dead, wide, len(places))
-            wanted = max(min(wanted, self.config.most_splats - count), 0)
-            wanted = self.fitting(step, info, splats, optimizers, wanted)
+            wanted = self.fitting(step, info, splats, optimizers, max(min(wanted, self.config.most_splats - count), 0))
             grown = draw(weights.index_fill(0, parents, 0.0), wanted)
         split(splats, optimizers, torch.cat([parents, grown]), places)
         source = torch.cat([torch.arange(count, device=dead.device).index_copy(0, places, parents), grown])
@@ -182,9 +181,7 @@ class ErrorGuidedDensification(Densification):
         stored = torch.sigmoid(splats["opacities"].detach()) - DECAY * (1 - min(step / self.end, 1.0))
         splats["opacities"].data.copy_(torch.logit(stored.clamp(1e-6, 1 - torch.finfo(stored.dtype).eps)))
         if self.verbose:
-            print(
-                f"Step {step}: {len(places)} GSs replaced, {len(grown)} split. Now having {len(splats['means'])} GSs."
-            )
+            print(f"Step {step}: {len(places)} GSs replaced, {len(grown)} split. Now having {count + len(grown)} GSs.")
 
     def _candidates(self, step: int, count: int, dead: Tensor, wide: Tensor, replaced: int) -> tuple[Tensor, int]:
         """Weights [N] by which splats are drawn to be split, and how many are wanted.

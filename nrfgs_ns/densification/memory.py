@@ -29,11 +29,8 @@ def most_splats(splats: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer
     """The most splats that a refinement may grow to; no limit on a CPU, and where there are none yet.
 
     Each will take what each takes now, in parameters, gradients, moments and a step's other tensors and lists. Besides,
-    while rows are added, parameters and moments are there twice.
-
-    Args:
-        splats, optimizers: as in `Densification.post_backward`.
-        later_pixels: by which the largest image of the training is larger than the present ones.
+    while rows are added, parameters and moments are there twice. The training's largest image has `later_pixels` more
+    than the present ones.
     """
     device, count = splats["means"].device, len(splats["means"])
     if device.type != "cuda" or count == 0:
@@ -43,9 +40,8 @@ def most_splats(splats: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer
     copied = parameters + sum(value.nbytes for value in moments if value.dim() > 0)
     # Counted as what does not grow: photographs, for the most part; also what several graphs leave.
     fixed = max(torch.cuda.memory_allocated(device) - copied - parameters, 0)
-    held = torch.cuda.memory_reserved(device)
     room = SHARE * available(device) - fixed - BYTES_PER_PIXEL * later_pixels
-    return max(int(count * room / (held - fixed + copied)), 0)
+    return max(int(count * room / (torch.cuda.memory_reserved(device) - fixed + copied)), 0)
 
 
 def available(device: torch.device) -> int:

@@ -108,8 +108,7 @@ class NrfgsModel(SplatfactoModel):
 
     @property
     def suited_head(self) -> dict[str, Any]:
-        """Options of the head that a checkpoint, the number of views or the densification has set, not the
-        configuration."""
+        """Options of the head that a checkpoint, the number of views or the densification has set."""
         return differences(self.config.appearance, self.head.config)
 
     def _initial_splats(self) -> dict[str, Tensor]:

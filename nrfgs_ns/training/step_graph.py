@@ -60,7 +60,6 @@ class StepGraphs:
         """a pool of memory and a stream, of all graphs"""
         self._given_up = False
         self._said: set[str] = set()
-        """what has been reported"""
 
     def _takes(self, batch: Mapping[str, Any]) -> bool:
         """Whether this step can be recorded; each thing that prevents it is reported once."""
@@ -70,8 +69,9 @@ class StepGraphs:
         if (obstacle := self._obstacle(batch)) is not None:
             self._is_new()  # graphs of splats that are gone would keep their memory
             if obstacle not in self._said:
-                why = f"Steps are not recorded as a CUDA graph, so they take longer: {obstacle}."
-                CONSOLE.print(why, soft_wrap=True)
+                CONSOLE.print(
+                    f"Steps are not recorded as a CUDA graph, so they take longer: {obstacle}.", soft_wrap=True
+                )
                 self._said.add(obstacle)
             return False
         # Smaller images go to pytorch_msssim, which copies its window from the host.

@@ -231,8 +231,8 @@ class NrfgsTrainer(Trainer):
         if self.line is not None and step_check(step, self.config.steps_per_eval_all_images):
             self.line.step_aside()  # the evaluation has a progress bar of its own
         super().eval_iteration(step)
-        intervals = self.config.steps_per_eval_image, self.config.steps_per_eval_all_images
-        if any(step_check(step, steps) for steps in intervals):
+        config = self.config
+        if step_check(step, config.steps_per_eval_image) or step_check(step, config.steps_per_eval_all_images):
             give_back(self.pipeline.model.device)
 
     def train_iteration(self, step: int):
