@@ -83,13 +83,10 @@ def over_same(scene: str) -> str:
     return f"{signed(mean(today(scene, FIELD), 'psnr') - mean(today(scene, SAME), 'psnr'))} dB"
 
 
-def demo(what: str) -> str:
-    """The demo's gain where it shines by the field's residual, of each seed, or the seconds of its trainings."""
+def demo() -> str:
+    """The demo's gain where it shines by the field's residual, of each seed."""
     seeds = [record["methods"]["nrfgs"] for _, record in sorted(records("demo").items())]
-    if what == "gain":
-        return ", ".join(signed(one["shine"]["psnr"] - one["shine"]["psnr_base"], 1) for one in seeds)
-    seconds = [one["train"]["processor_seconds"] for one in seeds]
-    return f"{min(seconds):.0f} to {max(seconds):.0f}"
+    return ", ".join(signed(one["shine"]["psnr"] - one["shine"]["psnr_base"], 1) for one in seeds)
 
 
 def cell(runs: Trainings) -> str:

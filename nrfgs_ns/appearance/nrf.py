@@ -44,7 +44,7 @@ LATENT_STD = 0.1
 
 @dataclass
 class NrfConfig(AppearanceHeadConfig):
-    """Neural residual field. The defaults are the paper's, except for zero outputs and the straight-through bound."""
+    """Neural residual field. The defaults are the paper's, except for zero outputs and `opacity_bound`."""
 
     _target: type = field(default_factory=lambda: NeuralResidualField)
     latent_dim: int = 32

@@ -110,6 +110,20 @@ def test_what_is_not_recorded_is_said_once(build, option, step, capsys, monkeypa
     assert capsys.readouterr().out.count("not recorded") == 1
 
 
+def test_graphs_of_replaced_splats_are_freed_while_steps_are_not_recorded(build, monkeypatch):
+    pipeline, graphs = build("cpu", "nrfgs", "--pipeline.model.robust-loss", "0.1")
+    model, batch = pipeline.model, pipeline.datamanager.train_view(0)[1]
+    monkeypatch.setattr(type(model), "device", torch.device("cuda"))
+    graphs._is_new()
+    graphs._graphs = {None: SimpleNamespace(most_pairs=lambda: 2, count=1)}
+    model.step = 499
+    assert graphs._takes(batch) and graphs._graphs
+    model.step = 500
+    for name, value in model.gauss_params.items():
+        model.gauss_params[name] = torch.nn.Parameter(value.detach().clone())
+    assert not graphs._takes(batch) and not graphs._graphs
+
+
 RECORDED = [*(f"densification {name},opacity_seen={seen}" for name in STRATEGIES for seen in ("base", "peak"))]
 RECORDED = [*RECORDED, "robust-loss 0.1"]
 """Options that change what a step does."""
