@@ -2,7 +2,7 @@
 """What fits on a card: trainings within the memory of smaller cards, and what a million splats take, by part.
 
     python -m nrfgs_lab.timing.fits --out fits.jsonl --data SCENE \\
-        --options "--pipeline.model.densification error-guided,threshold=0.0005,most_splats=10000000"
+        --options="--pipeline.model.densification error-guided,threshold=0.0005,most_splats=10000000"
 
 Each training and each number of splats is a line of JSON in the file `out`; those there are skipped. A card of 12 GB is
 a process that may take 12 GB, CUDA's own part included. The difference of two numbers of splats is what splats take.

@@ -35,6 +35,9 @@ CHANGE_BEFORE = CHANGE + "_before"
 HELD = "held_at"
 """Name, in a strategy's `state`, of a pair: the number of splats at which memory has held growth, and the bytes of
 memory that there were; None: it was never short."""
+NEAR = 1.1
+"""Estimates of the most splats that are farther above their number than this do not end growth: they are low, because
+what does not grow, images above all, counts as growing with the splats."""
 UNSEEN = -2.0
 """Change of a splat that no view has shown: less than any change."""
 
@@ -210,8 +213,8 @@ class Densification(ABC):
     def fitting(self, step: int, info: Mapping[str, Any], splats: Splats, optimizers: Optimizers, wanted: int) -> int:
         """How many of `wanted` more splats the GPU has memory for. Called in every refinement that may grow.
 
-        Where it is fewer, a line says so, and the number then reached is the training's limit: it is in checkpoints, so
-        that a continued training has the same, unless it has more memory, or less.
+        Where it is fewer, and the limit near, a line says so, and the number then reached is the training's limit: it
+        is in checkpoints, so that a continued training has the same, unless it has more memory, or less.
         """
         count, within = len(splats["means"]), self.least(memory.allowed(splats["means"].device))
         if self.state[HELD] is None or self.state[HELD][1] != within:
@@ -219,7 +222,10 @@ class Densification(ABC):
             most = self.least(memory.most_splats(splats, optimizers, later))
             if self.least(most - count - wanted) >= 0:
                 return wanted
-            most = max(most, -self.least(-count))  # the most that a device has
+            largest = -self.least(-count)  # the most that a device has
+            if most > NEAR * largest:
+                return min(wanted, most - count)
+            most = max(most, largest)
             self.state[HELD] = most, within
             if self.verbose:
                 held = f"growth is held at {most:,} splats a GPU, since its memory has no room for more"

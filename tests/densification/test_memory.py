@@ -95,6 +95,24 @@ def test_growth_ends_where_memory_does(name, monkeypatch, capsys):
     assert len(table) > 41
 
 
+@pytest.mark.parametrize("name", ["error-guided", "mcmc"])
+def test_what_does_not_grow_does_not_end_growth(name, monkeypatch, capsys):
+    """A card has memory for 600 splats beside images that take as much as 400, which the estimate counts as growing."""
+
+    def most(splats, *_):
+        count = len(splats["means"])
+        return 1000 * count // (count + 400)
+
+    monkeypatch.setattr(memory, "most_splats", most)
+    table, rules = Table(40), strategy(name, **{**OPTIONS.get(name, {}), "budget": 900})
+    torch.manual_seed(0)
+    for step in range(REFINES, REFINES + 200 * 70, 200):
+        table.step(rules, step, gradient=1.0)
+        assert len(table) <= 600
+    assert len(table) > 0.9 * 600
+    assert capsys.readouterr().out.count("growth is held") == 1
+
+
 @pytest.mark.parametrize("name", ["splatfacto", "original"])
 def test_the_largest_gradients_grow(name, monkeypatch):
     """Splats that are wide in the image, but not by gradient, do not."""
