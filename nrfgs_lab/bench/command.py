@@ -24,24 +24,10 @@ import tyro
 from filelock import FileLock
 
 from nrfgs_lab.bench.data import parser_options
+from nrfgs_lab.bench.file import as_list, load_spec, make_spec, scene_path
+from nrfgs_lab.bench.job import Job, command, differences, identity, read_record
 from nrfgs_lab.bench.report import FAILURE, report
-from nrfgs_lab.bench.spec import (
-    DEFAULT,
-    Cell,
-    Job,
-    Scene,
-    Spec,
-    as_list,
-    cells_of,
-    command,
-    differences,
-    identity,
-    load_spec,
-    make_spec,
-    read_record,
-    scene_path,
-    steps_of,
-)
+from nrfgs_lab.bench.spec import DEFAULT, Cell, Scene, Spec, cells_of, steps_of
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import check_writable, write_whole
 
