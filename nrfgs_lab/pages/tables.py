@@ -21,7 +21,7 @@ from typing import Any
 import yaml
 
 from nrfgs_lab.pages import appendix, few_views, files, methods, others, speed
-from nrfgs_lab.pages.runs import ROOT, grid, records, signed
+from nrfgs_lab.pages.runs import ROOT, bench_rows, grid, records, signed
 
 OPENING = "<!-- table "
 BLOCK = re.compile(r"<!-- table (\w+\.\w+)(\([^\n]*?\))? -->(.*?)<!-- end -->", re.DOTALL)
@@ -119,6 +119,8 @@ def single(words: str) -> Any:
     if not path:
         return float(study)
     value: Any = records(study)
+    if path[0] == "rows":  # of a benchmark: SCENE/STRATEGY/RUN, column, seed
+        value, path = {"/".join(place): row.values for place, row in bench_rows(study).items()}, path[1:]
     for key in path:
         value = step(value, key)
     return value
