@@ -3,6 +3,7 @@
 
 from statistics import fmean, median
 
+from nrfgs_lab.pages.few_views import cell
 from nrfgs_lab.pages.runs import (
     ORIGINAL,
     VIEWS,
@@ -37,17 +38,12 @@ def gain(ours: Trainings, theirs: Trainings, metric: str) -> float:
 def every() -> str:
     """3DGS's PSNR and SSIM, and the others' gains, dB and SSIM x 1000; the median share of its splats."""
     psnr = f"{mean_of(bench_rows('paper')['bonsai', ORIGINAL, BASE], 'PSNR'):.2f}"
-    body = [[BASE, "", psnr, *_levels(), "", ""]]
+    body = [[BASE, "", psnr, *(cell(half(scene, BASE)) for scene in VIEWS), "", ""]]
     for run in METHODS:
         paper = "{:+.2f} ({:.2f})".format(*OF_THE_PAPER[run]) if run in OF_THE_PAPER else ""
         share = median(mean(half(one, run), "splats") / mean(half(one, BASE), "splats") for one in VIEWS)
         body.append([run, paper, _protocol(run), *_gains(run), f"{share:.2f}", _ahead(run)])
     return grid(["", "paper", "protocol", *VIEWS, "splats", "ahead"], body)
-
-
-def _levels() -> list[str]:
-    every = [half(scene, BASE) for scene in VIEWS]
-    return [f"{mean(runs, 'psnr'):.2f}/{mean(runs, 'ssim'):.3f}" for runs in every]
 
 
 def _gains(run: str) -> list[str]:
@@ -56,8 +52,8 @@ def _gains(run: str) -> list[str]:
     for scene in VIEWS:
         base = half(scene, BASE)
         gains = {one: gain(half(scene, one), base, "psnr") for one in METHODS}
-        cell = f"{signed(gains[run], 2)}/{signed(1000 * gain(half(scene, run), base, 'ssim'), 0)}"
-        cells.append(f"**{cell}**" if gains[run] == max(gains.values()) > 0 else cell)
+        both = f"{signed(gains[run], 2)}/{signed(1000 * gain(half(scene, run), base, 'ssim'), 0)}"
+        cells.append(f"**{both}**" if gains[run] == max(gains.values()) > 0 else both)
     return cells
 
 
