@@ -238,9 +238,8 @@ class NrfgsModel(SplatfactoModel):
     @torch.no_grad()
     def get_base_color(self, camera: Cameras) -> Tensor:
         """The image [H, W, 3] of the base colours and opacities alone."""
-        field = self.field
-        view = self.project(camera, field.splats)
-        return self.composite(view, field.base_of(view))[0]["rgb"]
+        view = self.project(camera)
+        return self.composite(view, self.field.base_of(view))[0]["rgb"]
 
     # Training.
 
@@ -342,11 +341,9 @@ class NrfgsModel(SplatfactoModel):
 
         A metric without a value (LPIPS without its weights, MS-SSIM of a small image) is left out.
         """
-        truth = self.truth_of(batch, outputs["background"])
-        rgb = outputs["rgb"]
-        metrics = image_metrics(rgb, truth, self.mask_of(batch))
-        metrics = {name: value for name, value in metrics.items() if value is not None}
-        return metrics, {"img": torch.cat([truth, rgb], dim=1)}
+        rgb, truth = outputs["rgb"], self.truth_of(batch, outputs["background"])
+        metrics = image_metrics(rgb, truth, self.mask_of(batch)).items()
+        return {name: value for name, value in metrics if value is not None}, {"img": torch.cat([truth, rgb], dim=1)}
 
     # Viewer and exporter. The exporter reads splats with spherical harmonics from the properties below. After `fit_on`,
     # which neither a training nor a viewer calls, they are harmonics fitted to the head (`harmonics_fit.py`).

@@ -188,9 +188,8 @@ def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool)
         ),
     }
     notes = [*pipeline.notes, *(note for note, holds in chosen.items() if holds)]
-    count = f"{given} training view{'s' * (given != 1)}"
-    if views != given:
-        count = f"{views} different training views of {given}"
+    one = f"{given} training view{'s' * (given != 1)}"
+    count = one if views == given else f"{views} different training views of {given}"
     if parts:
         CONSOLE.print(f"{count}: {', '.join(parts)} (docs/captures.md).", soft_wrap=True)
     data = pipeline.datamanager.train_dataset
