@@ -34,6 +34,8 @@ SET_HERE = {
 """Options of ns-train that the benchmark sets -> what to use instead."""
 NO_KEYS = {Method: ("name",), Scene: ("held_out", "held_out_every", "held_out_by")}
 """Fields that a file does not give."""
+LISTS = "strategies", "seeds", "held_out"
+"""Keys with a list of values, or with one."""
 LEASTS = {
     **dict.fromkeys(("steps", "downscale", "views", "jobs", "gpus", "checkpoint_every"), 1),
     **dict.fromkeys(("seeds", "held_out", "train_views"), 0),
@@ -76,7 +78,7 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
     for key in ("runs", "scenes"):
         _require(bool(content.get(key)), f"{where}: {key} is missing or empty. Name at least one.")
     _require(isinstance(content["runs"], dict), f"{where}: runs must map names to methods.")
-    lists = {key: as_list(content[key]) for key in ("strategies", "seeds", "held_out") if key in content}
+    lists = {key: as_list(content[key]) for key in LISTS if key in content}
     runs = [_method(name, value, f"{where}: runs: {name}") for name, value in content["runs"].items()]
     scenes = [_scene(value, f"{where}: scenes") for value in as_list(content["scenes"])]
     spec = Spec(**{**content, **lists, "runs": runs, "scenes": scenes})
@@ -148,7 +150,7 @@ def _checked(value: dict[str, Any], kind: type, where: str) -> dict[str, Any]:
     _require(not unknown, f"{where}: unknown key {', '.join(unknown)}. Known are {', '.join(known)}.")
     for key in sorted(value.keys() & LEASTS.keys()):
         least = LEASTS[key]
-        for number in as_list(value[key]):
+        for number in as_list(value[key]) if key in LISTS else [value[key]]:
             is_whole = isinstance(number, int) and not isinstance(number, bool) and number >= least
             is_left_open = number is known[key] is None or (kind is Method and number == OWN)
             _require(

@@ -111,15 +111,11 @@ def _splats(trial: str) -> dict[str, float]:
 def _changes(sitting: str, trial: str) -> dict[str, tuple[float, float, float, int]]:
     """Changes by a trial of a sitting, against its default with the same seeds, by capture: PSNR and SSIM, the share of
     the default's splats, and the number of pairs."""
-    runs = {}
-    for one in records("default").values():
-        kind, _, name = one["name"].partition(": ")
-        if kind == sitting and name in ("default", trial):
-            runs[name, one["scene"], one["seed"]] = one
+    runs = {(one["name"], one["scene"], one["seed"]): one for one in records("default").values()}
     pairs = defaultdict(list)
     for (name, scene, seed), one in runs.items():
-        if name == trial and ("default", scene, seed) in runs:
-            base = runs["default", scene, seed]
+        base = runs.get((f"{sitting}: default", scene, seed))
+        if name == f"{sitting}: {trial}" and base:
             change = *(one[metric] - base[metric] for metric in ("psnr", "ssim")), one["splats"] / base["splats"]
             pairs[scene.rpartition("/")[2]].append(change)
     return {scene: (*map(fmean, zip(*them, strict=True)), len(them)) for scene, them in pairs.items()}

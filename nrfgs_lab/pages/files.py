@@ -20,11 +20,6 @@ def reports(scene: str) -> dict[str, Report]:
     return dict(sorted(((n, one) for n, one in every.items() if "bytes" in one), key=lambda pair: -pair[1]["bytes"]))
 
 
-def tuned(scene: str) -> dict[str, Report]:
-    """The fine-tuned files of a scene, by rate."""
-    return {name: one for name, one in reports(scene).items() if name.startswith("rate")}
-
-
 def added(scene: str) -> str:
     """Per cent of a training's seconds that the longest of its fine-tunes takes."""
     longest = max(one["seconds"]["finetune"] for one in reports(scene).values() if one.get("finetune"))
@@ -43,7 +38,7 @@ def draw() -> None:
         figure, panel = pyplot.subplots(figsize=(5.6, 3.4), dpi=110)
         for number, scene in enumerate(CAPTURES):
             color, points = f"C{number}", {n: (r["bytes"] / 1e6, -r["loss_db"]) for n, r in reports(scene).items()}
-            lines = {name: points[name] for name in tuned(scene)}
+            lines = {name: place for name, place in points.items() if name.startswith("rate")}  # fine-tuned
             panel.plot(*zip(*lines.values(), strict=True), "o-", color=color, markersize=4, label=scene)
             for name, place in lines.items():
                 words = name.removeprefix("rate-")
