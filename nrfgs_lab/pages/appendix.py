@@ -111,7 +111,7 @@ def _splats(trial: str) -> dict[str, float]:
 def _changes(sitting: str, trial: str) -> dict[str, tuple[float, float, float, int]]:
     """Changes by a trial of a sitting, against its default with the same seeds, by capture: PSNR and SSIM, the share of
     the default's splats, and the number of pairs."""
-    runs = {(one["name"], one["scene"], one["seed"]): one for one in records("default").values()}
+    runs = {(one["name"], one["scene"], one.get("seed")): one for one in records("default").values()}
     pairs = defaultdict(list)
     for (name, scene, seed), one in runs.items():
         base = runs.get((f"{sitting}: default", scene, seed))
