@@ -9,10 +9,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from statistics import fmean
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
-from rich.table import Table
+from rich.table import Column, Table
 from torch.utils.benchmark import Timer
 
 from nrfgs_lab.training_run import machine
@@ -141,17 +142,13 @@ class FieldViews:
         for view, truth, mask in self.views:
             outputs, _ = self.model.composite(view, field.seen_from(view))
             scores.append(psnr(outputs["rgb"], truth, mask))
-        scores = [score for score in scores if score is not None]
-        return sum(scores) / max(len(scores), 1)
+        return fmean([score for score in scores if score is not None] or [0.0])
 
     @torch.no_grad()
     def head_seconds(self, field: Field) -> float:
         """Mean of the head's time over the views."""
-        seconds = []
-        for view, _, _ in self.views:
-            timer = Timer("field.seen_from(view)", globals={"field": field, "view": view})
-            seconds.append(min(timer.timeit(1).mean for _ in range(TIMED)))
-        return sum(seconds) / len(seconds)
+        timers = [Timer("field.seen_from(view)", globals={"field": field, "view": view}) for view, _, _ in self.views]
+        return fmean(min(timer.timeit(1).mean for _ in range(TIMED)) for timer in timers)
 
 
 def row(part: str, group: str, field: Field, views: FieldViews, full: float | None) -> Row:
@@ -204,9 +201,8 @@ def mean_log_distance(model, cameras) -> float:
 
 def table(rows: list[Row]) -> Table:
     """Table of the rows, a section for each group."""
-    printed = Table()
-    for column in ("left out", "PSNR (dB)", "loss (dB)", "MB", "head (ms)"):
-        printed.add_column(column, justify="left" if column == "left out" else "right")
+    columns = (Column(name, justify="right") for name in ("PSNR (dB)", "loss (dB)", "MB", "head (ms)"))
+    printed = Table("left out", *columns)
     for entry, following in zip(rows, [*rows[1:], None], strict=True):
         numbers = f"{entry.psnr:.2f}", f"{entry.loss_db:.3f}", f"{entry.bytes / 1e6:.2f}"
         last = following is not None and following.group != entry.group

@@ -62,7 +62,6 @@ def method(name: str, appearance: AppearanceHeadConfig, description: str, **opti
             steps_per_eval_batch=0,
             steps_per_save=2000,
             steps_per_eval_all_images=1000,
-            mixed_precision=False,
             # The profiler's table of durations would end every command. For what is logged the host waits until the GPU
             # has nothing left to do.
             logging=LoggingConfig(profiler="none", local_writer=ProgressLineConfig(), steps_per_log=100),

@@ -18,44 +18,21 @@ import time
 from dataclasses import asdict, dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import IO, Annotated
+from typing import Annotated
 
 import tyro
 from filelock import FileLock
 
 from nrfgs_lab.bench.data import parser_options
+from nrfgs_lab.bench.file import as_list, load_spec, make_spec, scene_path
+from nrfgs_lab.bench.job import Job, command, differences, identity, read_record
 from nrfgs_lab.bench.report import FAILURE, report
-from nrfgs_lab.bench.spec import (
-    DEFAULT,
-    Cell,
-    Job,
-    Scene,
-    Spec,
-    as_list,
-    cells_of,
-    command,
-    differences,
-    identity,
-    load_spec,
-    make_spec,
-    read_record,
-    scene_path,
-    steps_of,
-)
+from nrfgs_lab.bench.spec import DEFAULT, Cell, Scene, Spec, cells_of, steps_of
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import check_writable, write_whole
 
 CHILD = (sys.executable, "-m", "nrfgs_lab.bench.run")
 """Command of a child; the file that describes its job is appended."""
-
-
-@dataclass
-class Running:
-    """A running child."""
-
-    name: str
-    process: subprocess.Popen
-    log: IO
 
 
 @dataclass
@@ -213,38 +190,36 @@ class Bench:
                     say(f"Time is up: {len(waiting) + len(running)} runs are left for the next call.")
                     break
                 for slot, gpu in enumerate(slots):
-                    if slot in running and running[slot].process.poll() is not None:
+                    if slot in running and running[slot][1].poll() is not None:
                         finished += 1
-                        say(f"{self.ended(running.pop(slot))} ({finished} of {len(pending)})")
+                        say(f"{self.ended(*running.pop(slot))} ({finished} of {len(pending)})")
                     if slot not in running and waiting:
-                        running[slot] = self.start(*waiting.pop(0), gpu, threads)
-                        say(f"{running[slot].name}: started")
+                        name, job = waiting.pop(0)
+                        running[slot] = name, self.start(name, job, gpu, threads)
+                        say(f"{name}: started")
                 time.sleep(0.2)
         finally:
-            for child in running.values():
-                child.process.terminate()
-            for child in running.values():
-                child.process.wait()
-                child.log.close()
+            for _, child in running.values():
+                child.terminate()
+            for _, child in running.values():
+                child.wait()
 
-    def ended(self, child: Running) -> str:
+    def ended(self, name: str, child: subprocess.Popen) -> str:
         """What became of a child, in words; a failure is noted beside its record."""
-        child.log.close()
-        record = self.record(child.name)
-        if child.process.returncode == 0 and record.exists():
-            return f"{child.name}: done"
-        write_whole(record.with_suffix(FAILURE), f"{child.process.returncode}\n")
-        return f"{child.name}: FAILED, see {child.log.name}"
+        record = self.record(name)
+        if child.returncode == 0 and record.exists():
+            return f"{name}: done"
+        write_whole(record.with_suffix(FAILURE), f"{child.returncode}\n")
+        return f"{name}: FAILED, see {self.work / name}.log"
 
-    def start(self, name: str, job: Job, gpu: str, threads: int) -> Running:
+    def start(self, name: str, job: Job, gpu: str, threads: int) -> subprocess.Popen:
         """Start a job on a GPU. OMP_NUM_THREADS goes before `threads`."""
         self.record(name).with_suffix(FAILURE).unlink(missing_ok=True)
         file = self.work / f"{name}.job.json"
         write_whole(file, json.dumps(asdict(job), indent=1))
-        log = (self.work / f"{name}.log").open("a")
         environment = {"OMP_NUM_THREADS": str(threads), **os.environ, "CUDA_VISIBLE_DEVICES": gpu}
-        process = subprocess.Popen([*CHILD, str(file)], stdout=log, stderr=subprocess.STDOUT, env=environment)
-        return Running(name, process, log)
+        with (self.work / f"{name}.log").open("a") as log:
+            return subprocess.Popen([*CHILD, str(file)], stdout=log, stderr=subprocess.STDOUT, env=environment)
 
 
 def say(text: str) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw
 
+from nrfgs_lab.sheets import GAP, picture, sheet
 from nrfgs_ns.files import whole
 
 VIEWS = 2
@@ -17,7 +18,6 @@ CROP_PIXELS = 220
 """Side of a crop in the sheet."""
 ERROR_GAIN = 4.0
 """Factor of the error maps."""
-TITLE, GAP = 16, 4
 ACROSS = 8
 """Crops side by side, with the truth; more go below."""
 
@@ -43,16 +43,10 @@ def crop_sheet(pictures: dict[str, Path], path: Path) -> None:
     if not places:
         return
     places = sorted(places, key=lambda place: -place[0])[:VIEWS]
+    titles = [f"test view {view}; below: |error| x {ERROR_GAIN:g}" for *_, view in places]
     parts = [_view(*read(files, view), top, left) for _, top, left, view in places]
-    width, height = max(part.width for part in parts), sum(part.height + TITLE + GAP for part in parts)
-    sheet = Image.new("RGB", (width, height), "white")
-    y = 0
-    for part, (*_, view) in zip(parts, places, strict=True):
-        ImageDraw.Draw(sheet).text((2, y + 2), f"test view {view}; below: |error| x {ERROR_GAIN:g}", fill="black")
-        sheet.paste(part, (0, y + TITLE))
-        y += TITLE + part.height + GAP
     with whole(path) as aside:
-        sheet.save(aside, format="PNG")
+        sheet([[pair] for pair in zip(titles, parts, strict=True)]).save(aside, format="PNG")
 
 
 def numbered(folder: Path) -> dict[int, Path]:
@@ -92,30 +86,19 @@ def _view(truth: Images, renders: dict[str, Images], top: int, left: int) -> Ima
     """One view: the whole truth, and lines of up to `ACROSS` crops above their errors."""
     side = crop_side(*truth.shape[:2])
     box = slice(top, top + side), slice(left, left + side)
-    scale = (2 * CROP_PIXELS + GAP) / truth.shape[0]
-    whole = _image(truth).resize((max(1, int(truth.shape[1] * scale)), 2 * CROP_PIXELS + GAP))
+
+    def cut(pixels: Images) -> Image.Image:
+        return picture(pixels[box]).resize((CROP_PIXELS, CROP_PIXELS), Image.Resampling.NEAREST)
+
+    columns = [("truth", cut(truth))]
+    for label, image in renders.items():
+        error = cut(ERROR_GAIN * np.abs(image - truth))
+        columns.append((label, sheet([[("", cut(image))], [("", error)]])))
+    height = 2 * CROP_PIXELS + GAP
+    scale = height / truth.shape[0]
+    overview = picture(truth).resize((max(1, int(truth.shape[1] * scale)), height))
     corners = [(left * scale, top * scale), ((left + side) * scale, (top + side) * scale)]
-    ImageDraw.Draw(whole).rectangle(corners, outline="red", width=2)
-    columns = {"truth": truth, **renders}
-    step = CROP_PIXELS + GAP
-    lines, across = -(-len(columns) // ACROSS), min(ACROSS, len(columns))
-    size = whole.width + GAP + step * across, lines * (TITLE + whole.height + GAP) - GAP
-    result = Image.new("RGB", size, "white")
-    result.paste(whole, (0, TITLE))
-    draw = ImageDraw.Draw(result)
-    for number, (label, image) in enumerate(columns.items()):
-        line, column = divmod(number, ACROSS)
-        x, y = whole.width + GAP + column * step, line * (TITLE + whole.height + GAP)
-        draw.text((x + 2, y + 2), label, fill="black")
-        result.paste(_enlarged(image[box]), (x, y + TITLE))
-        if label != "truth":
-            result.paste(_enlarged(ERROR_GAIN * np.abs(image - truth)[box]), (x, y + TITLE + step))
-    return result
-
-
-def _image(pixels: Images) -> Image.Image:
-    return Image.fromarray((pixels.clip(0, 1) * 255).round().astype(np.uint8))
-
-
-def _enlarged(pixels: Images) -> Image.Image:
-    return _image(pixels).resize((CROP_PIXELS, CROP_PIXELS), Image.Resampling.NEAREST)
+    ImageDraw.Draw(overview).rectangle(corners, outline="red", width=2)
+    lines = [columns[first : first + ACROSS] for first in range(0, len(columns), ACROSS)]
+    blank = Image.new("RGB", overview.size, "white")
+    return sheet([[("", blank if number else overview), *line] for number, line in enumerate(lines)])

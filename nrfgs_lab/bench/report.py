@@ -7,7 +7,8 @@ from typing import Any
 
 from nrfgs_lab.bench import trade
 from nrfgs_lab.bench.crops import crop_sheet, numbered
-from nrfgs_lab.bench.spec import OWN, Cell, Spec, read_record
+from nrfgs_lab.bench.job import read_record
+from nrfgs_lab.bench.spec import OWN, Cell, Spec
 from nrfgs_lab.bench.table import COLUMNS, FAILED, MISSING, STALE, Row, markdown, with_averages
 from nrfgs_ns.files import write_whole
 

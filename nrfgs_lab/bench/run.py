@@ -21,8 +21,8 @@ from unittest import mock
 import torch
 from filelock import FileLock
 
+from nrfgs_lab.bench.job import Job
 from nrfgs_lab.bench.measure import measure
-from nrfgs_lab.bench.spec import Job
 from nrfgs_lab.training_run import TrainRecord, evaluate, machine, train
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints

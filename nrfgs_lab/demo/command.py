@@ -9,12 +9,13 @@ import shutil
 import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from statistics import fmean, stdev
 from time import process_time
 from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
+from rich.table import Column, Table
 
 from nrfgs_lab.scenes import SceneConfig, write_scene
 from nrfgs_ns.errors import InputError
@@ -58,7 +59,7 @@ class Demo:
         from nrfgs_ns.threads import few_threads  # imports torch
 
         with few_threads():
-            self._run(Console(file=sys.__stdout__))
+            self._run(Console(file=sys.__stdout__, highlight=False))
 
     def _run(self, screen: Console) -> None:
         if self.steps < 1:  # ns-train nrfgs would take 0 for as many as it finds right
@@ -80,7 +81,7 @@ class Demo:
             views, highlights = {}, {}
             for method, label in METHODS.items() if self.compare else [(NRF, METHODS[NRF])]:
                 args = self.train_args(method, data, steps)
-                progress.console.print(f"[dim]$ ns-train {shlex.join(args)}", highlight=False, soft_wrap=True)
+                progress.console.print(f"[dim]$ ns-train {shlex.join(args)}", soft_wrap=True)
                 with (self.out / f"{method}.log").open("w") as log, contextlib.redirect_stdout(log):
                     start = process_time()
                     with _bar(progress, f"train {label}", steps) as advance:
@@ -101,12 +102,12 @@ class Demo:
         summary = {"steps": steps, "scene": asdict(scene), "machine": machine(), "verdict": said, "methods": results}
         (self.out / "results.json").write_text(json.dumps(summary, indent=1) + "\n")
         screen.print(comparison(results, steps))
-        screen.print(f"[bold]{said}", highlight=False)
-        screen.print(f"In {self.out}: contact_sheet.png, highlight.png, results.json.", highlight=False)
+        screen.print(f"[bold]{said}")
+        screen.print(f"In {self.out}: contact_sheet.png, highlight.png, results.json.")
         screen.print("Look around with:")
         if activate := _activation():
-            screen.print(f"  {activate}", highlight=False, soft_wrap=True)
-        screen.print(f"  nrfgs view {results[NRF]['train']['config_path']}", highlight=False, soft_wrap=True)
+            screen.print(f"  {activate}", soft_wrap=True)
+        screen.print(f"  nrfgs view {results[NRF]['train']['config_path']}", soft_wrap=True)
 
     def scene(self) -> SceneConfig:
         """The scene's configuration: many views, close together, as small highlights need."""
@@ -155,8 +156,7 @@ def verdict(results: dict[str, dict[str, Any]], steps: int) -> str:
     gains = [a - b for a, b in zip(shine["views"], against, strict=True) if a is not None and b is not None]
     if len(gains) < 2:
         return f"Nothing shines, so NRF and {other} cannot be told apart."
-    mean = sum(gains) / len(gains)
-    error = math.sqrt(sum((gain - mean) ** 2 for gain in gains) / (len(gains) - 1) / len(gains))
+    mean, error = fmean(gains), stdev(gains) / math.sqrt(len(gains))
     ahead = sum(gain > 0 for gain in gains)
     where = f"{mean:+.2f} dB where it shines (ahead in {ahead} of {len(gains)} test views){rest}."
     if abs(mean) < max(SMALLEST_GAIN, 2 * error):
@@ -184,10 +184,8 @@ def _bar(progress: Progress, description: str, total: int):
 
 def comparison(results: dict[str, dict[str, Any]], steps: int) -> Table:
     """The table at the end, one column for each method."""
-    table = Table(title=f"Test views after {steps} steps each")
-    table.add_column("")
-    for method in results:
-        table.add_column(METHODS[method], justify="right")
+    columns = (Column(METHODS[method], justify="right") for method in results)
+    table = Table("", *columns, title=f"Test views after {steps} steps each")
 
     def row(name: str, part: str, key: str, form: str, unit: float = 1.0) -> None:
         values = [results[method][part].get(key) for method in results]

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The demo's pictures: test views with error maps, and a highlight seen along an arc."""
 
+from itertools import zip_longest
 from pathlib import Path
 
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 from torch import Tensor
 
 from nrfgs_lab.demo.views import Highlight, SeenView, brightest_window
+from nrfgs_lab.sheets import picture, sheet
 
 CELL = 240
 """Width of a picture, pixels."""
@@ -14,7 +16,6 @@ ERROR_GAIN = 4.0
 """Factor of absolute errors in the error maps."""
 RESIDUAL_GAIN = 4.0
 """Factor of the field's view-dependent part, around mid grey."""
-GAP, TITLE = 6, 26
 
 
 def contact_sheet(views: dict[str, list[SeenView]], path: Path) -> None:
@@ -58,14 +59,8 @@ def strip(highlights: dict[str, Highlight], path: Path) -> None:
 
 def grid(rows: list[list[Tensor]], titles: list[str], path: Path) -> None:
     """Write rows of pictures [H, W, 3], with values in [0, 1], as cells of one size below a line of titles."""
-    height = round(CELL * rows[0][0].shape[0] / rows[0][0].shape[1])
-    sheet = Image.new("RGB", (len(rows[0]) * (CELL + GAP) - GAP, TITLE + len(rows) * (height + GAP) - GAP), "white")
-    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(16)
-    for column, title in enumerate(titles):
-        draw.text((column * (CELL + GAP) + 2, 3), title, fill="black", font=font)
-    for y, row in enumerate(rows):
-        for x, image in enumerate(row):
-            pixels = (image.clamp(0, 1) * 255).round().byte().numpy()
-            cell = Image.fromarray(pixels).resize((CELL, height), Image.Resampling.BICUBIC)
-            sheet.paste(cell, (x * (CELL + GAP), TITLE + y * (height + GAP)))
-    sheet.save(path)
+    size = CELL, round(CELL * rows[0][0].shape[0] / rows[0][0].shape[1])
+    cells = [[picture(image).resize(size, Image.Resampling.BICUBIC) for image in row] for row in rows]
+    names = [titles, *[[]] * (len(rows) - 1)]
+    titled = [[*zip_longest(names_, row, fillvalue="")] for names_, row in zip(names, cells, strict=True)]
+    sheet(titled, gap=6, title=26, font=16).save(path)

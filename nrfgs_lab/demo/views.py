@@ -12,6 +12,7 @@ from torch import Tensor
 
 from nrfgs_lab.scenes import SceneConfig, build_scene, camera_rays, dome_cameras, render
 from nrfgs_lab.scenes.dataset import split_names
+from nrfgs_ns.image.metrics import psnr
 
 SHINES = 0.1
 """Change of white by gloss, in its strongest channel, from which a pixel of the truth counts as one that shines."""
@@ -119,17 +120,11 @@ def where_it_shines(views: list[SeenView]) -> dict[str, Any]:
         "psnr" over all views and "views" of each, the same of the base colour alone ("psnr_base", "views_base"), and
         "share" of such pixels.
     """
-    shines = [view.shine > SHINES for view in views]
-
-    def psnr(name: str, which: list[int]) -> float | None:
-        wrong = torch.cat([(getattr(views[i], name) - views[i].truth)[shines[i]] for i in which])
-        return float(-10 * torch.log10(wrong.square().mean())) if len(wrong) else None
-
-    everything = list(range(len(views)))
-    return {
-        "share": float(torch.stack(shines).float().mean()),
-        "psnr": psnr("rendered", everything),
-        "psnr_base": psnr("base", everything),
-        "views": [psnr("rendered", [i]) for i in everything],
-        "views_base": [psnr("base", [i]) for i in everything],
-    }
+    truths = torch.stack([view.truth for view in views])
+    inside = torch.stack([view.shine > SHINES for view in views])[..., None]
+    result: dict[str, Any] = {"share": float(inside.float().mean())}
+    for kind, name in (("", "rendered"), ("_base", "base")):
+        images = torch.stack([getattr(view, name) for view in views])
+        result[f"psnr{kind}"] = psnr(images.flatten(0, 1), truths.flatten(0, 1), inside.flatten(0, 1))
+        result[f"views{kind}"] = [*map(psnr, images, truths, inside)]
+    return result

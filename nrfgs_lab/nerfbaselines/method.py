@@ -197,7 +197,7 @@ def _method(name: str) -> type[Nrfgs]:
     return type(f"Nrfgs{name.title()}", (Nrfgs,), {"method": f"nrfgs-{name}", "__doc__": f"`ns-train nrfgs-{name}`."})
 
 
-NrfgsFast, NrfgsBest, NrfgsSh = map(_method, ("fast", "best", "sh"))
+NrfgsFast, NrfgsBest, NrfgsSh, NrfgsHarmonics = map(_method, ("fast", "best", "sh", "harmonics"))
 NrfgsVdgs, NrfgsGsnb, NrfgsSg = map(_method, ("vdgs", "gsnb", "sg"))
 
 

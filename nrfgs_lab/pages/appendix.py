@@ -53,6 +53,8 @@ RULES = {
     "splatfacto's rules, points from photographs": "splatfacto's rules, dense start",
 }
 """Label -> trial in results/default.json."""
+BASE = "splatfacto's rules"
+"""The trial that `RULES` are compared with."""
 
 
 def default() -> str:
@@ -83,42 +85,37 @@ def rivals() -> str:
     return grid(["capture, training views", "`nrfgs`", *RIVALS], body)
 
 
-def _held_out_gain(ours: dict, theirs: dict, views: list) -> str:
-    """Median dB, mean SSIM x 1000."""
-    if not views:
-        return ""
-    psnr, ssim = ([ours[view][number] - theirs[view][number] for view in views] for number in (0, 1))
-    return f"{signed(median(psnr), 2)}/{signed(1000 * fmean(ssim), 0)}"
-
-
-def gains_of(study: str, rows: dict[str, tuple[str, str]]) -> str:
-    """Gains of trials over others on the held-out views that both have, and their share of the others' splats."""
-    body = []
-    for label, trials in rows.items():
-        ours, theirs = (views_of(study, trial) for trial in trials)
-        cells = [_held_out_gain(ours, theirs, [v for v in theirs if v in ours and v[0] == scene]) for scene in FEW]
-        splats = [defaultdict(list), defaultdict(list)]
-        for one in records(study).values():
-            for number, trial in enumerate(trials):
-                if one["name"] == trial:
-                    splats[number][one["scene"]].append(one["splats"])
-        shares = [fmean(splats[0][scene]) / fmean(splats[1][scene]) for scene in splats[0].keys() & splats[1].keys()]
-        body.append([label, *cells, f"{median(shares):.1f}"])
+def rules() -> str:
+    """Gains of trials over splatfacto's rules on the held-out views that both have, and their share of its splats."""
+    body, theirs, base = [], views_of("default", BASE), _splats(BASE)
+    for label, trial in RULES.items():
+        ours, cells, splats = views_of("default", trial), [], _splats(trial)
+        for scene in FEW:
+            pairs = [(ours[view], theirs[view]) for view in theirs if view in ours and view[0] == scene]
+            psnr, ssim = ([one[number] - other[number] for one, other in pairs] for number in (0, 1))
+            cells.append(f"{signed(median(psnr), 2)}/{signed(1000 * fmean(ssim), 0)}" if pairs else "")
+        share = median(splats[scene] / base[scene] for scene in splats.keys() & base.keys())
+        body.append([label, *cells, f"{share:.1f}"])
     return grid(["", *FEW, "splats"], body)
+
+
+def _splats(trial: str) -> dict[str, float]:
+    """Mean number of splats of a trial's trainings, by scene."""
+    splats = defaultdict(list)
+    for one in records("default").values():
+        if one["name"] == trial:
+            splats[one["scene"]].append(one["splats"])
+    return {scene: fmean(counts) for scene, counts in splats.items()}
 
 
 def _changes(sitting: str, trial: str) -> dict[str, tuple[float, float, float, int]]:
     """Changes by a trial of a sitting, against its default with the same seeds, by capture: PSNR and SSIM, the share of
     the default's splats, and the number of pairs."""
-    runs = {}
-    for one in records("default").values():
-        kind, _, name = one["name"].partition(": ")
-        if kind == sitting and name in ("default", trial):
-            runs[name, one["scene"], one["seed"]] = one
+    runs = {(one["name"], one["scene"], one.get("seed")): one for one in records("default").values()}
     pairs = defaultdict(list)
     for (name, scene, seed), one in runs.items():
-        if name == trial and ("default", scene, seed) in runs:
-            base = runs["default", scene, seed]
+        base = runs.get((f"{sitting}: default", scene, seed))
+        if name == f"{sitting}: {trial}" and base:
             change = *(one[metric] - base[metric] for metric in ("psnr", "ssim")), one["splats"] / base["splats"]
             pairs[scene.rpartition("/")[2]].append(change)
     return {scene: (*map(fmean, zip(*them, strict=True)), len(them)) for scene, them in pairs.items()}
@@ -160,7 +157,7 @@ def scale(column: str, factor: str, form: str) -> str:
 BLOCKS = {
     "tables.default": default,
     "tables.rivals": rivals,
-    "tables.rules": lambda: gains_of("default", {label: (one, "splatfacto's rules") for label, one in RULES.items()}),
+    "tables.rules": rules,
     "captures.logit": logit,
     "tables.gaps": lambda: changes(GAPS, "gaps"),
     "tables.half_size": lambda: changes(HALF_SIZE, "half size"),

@@ -4,11 +4,10 @@
 python -m nrfgs_lab.pages.files        # writes docs/images/compact-trade.png
 """
 
-from statistics import fmean
 from typing import Any
 
 from nrfgs_lab.pages.few_views import SHRUNK, runs_of
-from nrfgs_lab.pages.runs import ROOT, records, table
+from nrfgs_lab.pages.runs import ROOT, grid, mean, records
 from nrfgs_ns.files import whole
 
 CAPTURES = "bonsai", "goldcape", "fox"
@@ -19,11 +18,6 @@ def reports(scene: str) -> dict[str, Report]:
     """The records of a scene's files, the largest file first."""
     every = {name.removeprefix(f"{scene}-"): one for name, one in records("compact").items() if name.startswith(scene)}
     return dict(sorted(((n, one) for n, one in every.items() if "bytes" in one), key=lambda pair: -pair[1]["bytes"]))
-
-
-def tuned(scene: str) -> dict[str, Report]:
-    """The fine-tuned files of a scene, by rate."""
-    return {name: one for name, one in reports(scene).items() if name.startswith("rate")}
 
 
 def added(scene: str) -> str:
@@ -44,7 +38,7 @@ def draw() -> None:
         figure, panel = pyplot.subplots(figsize=(5.6, 3.4), dpi=110)
         for number, scene in enumerate(CAPTURES):
             color, points = f"C{number}", {n: (r["bytes"] / 1e6, -r["loss_db"]) for n, r in reports(scene).items()}
-            lines = {name: points[name] for name in tuned(scene)}
+            lines = {name: place for name, place in points.items() if name.startswith("rate")}  # fine-tuned
             panel.plot(*zip(*lines.values(), strict=True), "o-", color=color, markersize=4, label=scene)
             for name, place in lines.items():
                 words = name.removeprefix("rate-")
@@ -73,15 +67,12 @@ def plies() -> dict[str, Report]:
 
 def losses() -> str:
     """Loss of a PLY file against each model; beside it, harmonics that were trained themselves."""
-    return table(
-        " | splats | MB | seconds | model | file | in Spark | harmonics, trained",
-        {scene: (scene, one) for scene, one in plies().items()},
-        lambda pair: f"{pair[1]['splats']:,}",
-        lambda pair: f"{pair[1]['bytes'] / 1e6:.1f}",
-        lambda pair: f"{pair[1]['seconds']['fit']:.0f}",
-        *(lambda pair, part=part: f"{pair[1][f'psnr_{part}']:.2f}" for part in ("model", "file", "on_screen")),
-        lambda pair: f"{fmean(run['psnr'] for run in runs_of(pair[0], SHRUNK)):.2f}",
-    )
+    body = []
+    for scene, one in plies().items():
+        cost = f"{one['splats']:,}", f"{one['bytes'] / 1e6:.1f}", f"{one['seconds']['fit']:.0f}"
+        psnr = *(one[f"psnr_{part}"] for part in ("model", "file", "on_screen")), mean(runs_of(scene, SHRUNK), "psnr")
+        body.append([scene, *cost, *map("{:.2f}".format, psnr)])
+    return grid(["", "splats", "MB", "seconds", "model", "file", "in Spark", "harmonics, trained"], body)
 
 
 BLOCKS = {

@@ -3,6 +3,7 @@
 
 from statistics import fmean, median
 
+from nrfgs_lab.pages.few_views import cell
 from nrfgs_lab.pages.runs import (
     ORIGINAL,
     VIEWS,
@@ -11,7 +12,6 @@ from nrfgs_lab.pages.runs import (
     grid,
     mean,
     mean_of,
-    records,
     signed,
     trainings,
     view_gains,
@@ -38,23 +38,12 @@ def gain(ours: Trainings, theirs: Trainings, metric: str) -> float:
 def every() -> str:
     """3DGS's PSNR and SSIM, and the others' gains, dB and SSIM x 1000; the median share of its splats."""
     psnr = f"{mean_of(bench_rows('paper')['bonsai', ORIGINAL, BASE], 'PSNR'):.2f}"
-    body = [[BASE, "", psnr, *_levels(), "", ""]]
+    body = [[BASE, "", psnr, *(cell(half(scene, BASE)) for scene in VIEWS), "", ""]]
     for run in METHODS:
         paper = "{:+.2f} ({:.2f})".format(*OF_THE_PAPER[run]) if run in OF_THE_PAPER else ""
         share = median(mean(half(one, run), "splats") / mean(half(one, BASE), "splats") for one in VIEWS)
         body.append([run, paper, _protocol(run), *_gains(run), f"{share:.2f}", _ahead(run)])
     return grid(["", "paper", "protocol", *VIEWS, "splats", "ahead"], body)
-
-
-def seeds(run: str, scene: str) -> str:
-    """Decibels between a run's best and worst seed under 3DGS's rules."""
-    values = [one["psnr"] for one in half(scene, run)]
-    return f"{max(values) - min(values):.1f}"
-
-
-def _levels() -> list[str]:
-    every = [half(scene, BASE) for scene in VIEWS]
-    return [f"{mean(runs, 'psnr'):.2f}/{mean(runs, 'ssim'):.3f}" for runs in every]
 
 
 def _gains(run: str) -> list[str]:
@@ -63,8 +52,8 @@ def _gains(run: str) -> list[str]:
     for scene in VIEWS:
         base = half(scene, BASE)
         gains = {one: gain(half(scene, one), base, "psnr") for one in METHODS}
-        cell = f"{signed(gains[run], 2)}/{signed(1000 * gain(half(scene, run), base, 'ssim'), 0)}"
-        cells.append(f"**{cell}**" if gains[run] == max(gains.values()) > 0 else cell)
+        both = f"{signed(gains[run], 2)}/{signed(1000 * gain(half(scene, run), base, 'ssim'), 0)}"
+        cells.append(f"**{both}**" if gains[run] == max(gains.values()) > 0 else both)
     return cells
 
 
@@ -98,13 +87,6 @@ def gains(rule: str) -> str:
         cells = [f"{run} {signed(mean_of(rows[scene, rule, run], 'PSNR') - base, 2)}" for run in METHODS[:-1]]
         parts.append(f"`{scene}` {', '.join(cells)}")
     return "; ".join(parts)
-
-
-def stored_opacity() -> str:
-    """PSNR of the field and GSNB on bonsai with 150,000 splats, where MCMC goes by the stored opacity."""
-    field = records("comparison")["stored-opacity/NRF-GS-mcmc@150000-bonsai-42"]["measured"]["test"]["psnr"]
-    other = mean_of(bench_rows("comparison")["bonsai", "mcmc@150000", "GSNB"], "PSNR")
-    return f"NRF-GS {field:.1f} dB, GSNB {other:.1f}"
 
 
 PARTS = {
@@ -187,34 +169,7 @@ def noise() -> str:
     return ", ".join(cells)
 
 
-def _level(study: str, run: str, scene: str = "bonsai", rule: str = ORIGINAL) -> str:
-    row = bench_rows(study)[scene, rule, run]
-    return f"{mean_of(row, 'PSNR'):.2f} dB with {mean_of(row, 'splats') / 1000:.0f}k"
-
-
-def start() -> str:
-    """PSNR of the small fox with the paper's start, and with ours."""
-    runs = "paper_s_start", "no_warm-up", "zero_start"
-    paper, cold, ours = (mean_of(bench_rows("warm-up")["fox", ORIGINAL, run], "PSNR") for run in runs)
-    return f"with {paper:.2f} dB, without {cold:.2f}; here {ours:.2f}"
-
-
-def rules() -> str:
-    """Field and splats under splatfacto's rules and 3DGS's, on bonsai."""
-    levels = (_level("speed", run, rule="own") for run in ("nrfgs", "nrfgs-best"))
-    return "{} (splatfacto's), {} (3DGS's)".format(*levels)
-
-
-def resets() -> str:
-    """VDGS's PSNR on bonsai in the paper's protocol, with and without resets of opacity, and its splats."""
-    levels = (_level("paper", run).replace("with ", "(") + ")" for run in ("VDGS", "VDGS_no_resets"))
-    return " to ".join(levels)
-
-
 BLOCKS = {
-    **{
-        f"comparison.{block.__name__}": block
-        for block in (every, seeds, gains, stored_opacity, parts, over_gsnb, chosen)
-    },
-    **{f"deviations.{block.__name__}": block for block in (worth, noise, start, rules, resets)},
+    **{f"comparison.{block.__name__}": block for block in (every, gains, parts, over_gsnb, chosen)},
+    **{f"deviations.{block.__name__}": block for block in (worth, noise)},
 }

@@ -2,9 +2,8 @@
 """Blocks of docs/exposure.md and docs/troubleshooting.md."""
 
 import re
-from statistics import fmean
 
-from nrfgs_lab.pages.runs import records, signed
+from nrfgs_lab.pages.runs import mean, records, signed
 
 
 def attack() -> str:
@@ -17,21 +16,13 @@ def attack() -> str:
 
 def exposure_gain(scene: str, off: str, on: str) -> str:
     """Gain in PSNR of test views, and colour-corrected, by learnt exposure, mean over seeds."""
-    ours, theirs = _exposure_tests(scene, on), _exposure_tests(scene, off)
-    psnr, corrected = (
-        signed(fmean(one[metric] for one in ours) - fmean(one[metric] for one in theirs), 2)
-        for metric in ("psnr", "cc_psnr")
-    )
+    tests: dict[str, list[dict[str, float]]] = {f"{scene}-{off}": [], f"{scene}-{on}": []}
+    for name, record in records("exposure").items():
+        if (case := name.rpartition("-")[0]) in tests and record["measured"]:
+            tests[case].append(record["measured"]["test"])
+    theirs, ours = tests.values()
+    psnr, corrected = (signed(mean(ours, metric) - mean(theirs, metric), 2) for metric in ("psnr", "cc_psnr"))
     return f"{psnr} dB, {corrected} colour-corrected"
-
-
-def _exposure_tests(scene: str, case: str) -> list[dict[str, float]]:
-    """Metrics of test views, a mapping for each seed."""
-    return [
-        record["measured"]["test"]
-        for name, record in records("exposure").items()
-        if name.rpartition("-")[0] == f"{scene}-{case}" and record["measured"]
-    ]
 
 
 def exposure_rule() -> str:

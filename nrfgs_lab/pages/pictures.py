@@ -16,9 +16,9 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from PIL import Image, ImageDraw
+from PIL import Image
 
-from nrfgs_lab.bench.crops import GAP, TITLE
+from nrfgs_lab.sheets import picture, sheet
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FIREFOX = shutil.which("firefox") or shutil.which("firefox-esr")
@@ -81,24 +81,21 @@ def firefox() -> Iterator:
         screen.wait()
 
 
-def sheet(config: Path, view: int = 1) -> None:
+def modes(config: Path, view: int = 1) -> None:
     """Write viewer-modes.jpg, every mode of the panel on one test view."""
     from nerfstudio.utils.eval_utils import eval_setup  # takes seconds
 
-    from nrfgs_ns.viewer.pictures import PictureOptions, legends, picture
+    from nrfgs_ns.viewer import pictures as viewed
 
     _, pipeline, _, _ = eval_setup(config, test_mode="test")
     model = pipeline.model
     camera, _ = pipeline.datamanager.fixed_indices_eval_dataloader[view]
-    names = list(legends(model.field))
-    height = round(WIDTH * camera.height.item() / camera.width.item())
-    rows = -(-len(names) // COLUMNS)
-    result = Image.new("RGB", (COLUMNS * (WIDTH + GAP) - GAP, rows * (TITLE + height + GAP) - GAP), "white")
-    for i, name in enumerate(names):
-        x, y = i % COLUMNS * (WIDTH + GAP), i // COLUMNS * (TITLE + height + GAP)
-        pixels = (255 * picture(model, camera, PictureOptions(name))["rgb"]).round().byte().cpu().numpy()
-        ImageDraw.Draw(result).text((x + 2, y + 3), name, fill="black")
-        result.paste(Image.fromarray(pixels).resize((WIDTH, height), Image.Resampling.LANCZOS), (x, y + TITLE))
+    size = WIDTH, round(WIDTH * camera.height.item() / camera.width.item())
+    shown = []
+    for name in viewed.legends(model.field):
+        rgb = viewed.picture(model, camera, viewed.PictureOptions(name))["rgb"]
+        shown.append((name, picture(rgb.cpu()).resize(size, Image.Resampling.LANCZOS)))
+    result = sheet([shown[first : first + COLUMNS] for first in range(0, len(shown), COLUMNS)])
     result.save(IMAGES / "viewer-modes.jpg", quality=88)
 
 
@@ -151,11 +148,8 @@ def page(path: Path, folder: Path) -> None:
                 tab.screenshot(path=folder / f"{window}-{name}.jpg", type="jpeg", quality=85)
             tab.close()
     shown = [Image.open(folder / name) for name in ("desktop-view.jpg", "phone-page.jpg")]
-    shown = [image.resize((image.width * HEIGHT // image.height, HEIGHT)) for image in shown]
-    pair = Image.new("RGB", (sum(image.width for image in shown) + BETWEEN, HEIGHT), "white")
-    pair.paste(shown[0])
-    pair.paste(shown[1], (shown[0].width + BETWEEN, 0))
-    pair.save(folder / "web.jpg", quality=85)
+    shown = [("", image.resize((image.width * HEIGHT // image.height, HEIGHT))) for image in shown]
+    sheet([shown], gap=BETWEEN).save(folder / "web.jpg", quality=85)
 
 
 if __name__ == "__main__":
@@ -163,5 +157,5 @@ if __name__ == "__main__":
     if others:
         page(first, *others)
     else:
-        sheet(first)
+        modes(first)
         viewer(first)

@@ -14,7 +14,8 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from nrfgs_lab.bench.table import BY_NAME, Row, grid
+from nrfgs_lab.bench.table import BY_NAME, Row
+from nrfgs_lab.bench.table import grid as grid
 
 ROOT = Path(__file__).resolve().parents[2]
 RUN = re.compile(r"runs/(?P<run>.+)-(?P<strategy>own|original|mcmc@\d+)-(?P<scene>[^-]+)-(?P<seed>\d+)")
@@ -80,12 +81,6 @@ def view_gains(ours: Trainings, theirs: Trainings, all_seeds: bool = False) -> l
             for name, psnr, *_ in one["per_image"] if all_seeds or one["seed"] in seeds else ():
                 views[name][number].append(psnr)
     return [fmean(one) - fmean(other) for one, other in views.values() if one and other]
-
-
-def table(head: str, rows: dict[str, Any], *cells: Callable[[Any], str]) -> str:
-    """A table with titles between vertical bars, and for each label and value of `rows` a cell by each function."""
-    body = ([label, *(cell(value) for cell in cells)] for label, value in rows.items())
-    return grid([title.strip() for title in head.split("|")], body)
 
 
 def signed(difference: float, digits: int = 1) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blocks of docs/speed.md, docs/speed.md, docs/nerfstudio/nrfgs.md and README.md: what trainings cost."""
+"""Blocks of docs/speed.md and README.md: what trainings cost."""
 
 from collections import defaultdict
 from datetime import datetime, timedelta
@@ -10,40 +10,32 @@ from typing import Any
 import numpy as np
 
 from nrfgs_lab.bench.table import Row
-from nrfgs_lab.pages.runs import VIEWS, bench_rows, grid, mean_of, records, signed, span, table
+from nrfgs_lab.pages.runs import VIEWS, bench_rows, grid, mean_of, records, signed, span
 
 SITTING = timedelta(minutes=10)
 """Trainings that began within it were made on one machine, one after the other."""
 
 
-def row_of(run: str) -> Row:
-    """Whole trainings of bonsai, by their names in the plan `speed`."""
-    return bench_rows("speed")["bonsai", "own", run]
-
-
-def values(column: str, run: str) -> list[float]:
-    """A quantity of whole trainings of bonsai, by seed."""
-    return list(row_of(run).values[column].values())
-
-
-def _ratios(column: str, run: str, base: str) -> list[float]:
+def ratio(column: str, run: str, base: str) -> str:
     """A quantity of trainings of bonsai over another's, of those made in one sitting."""
 
     def began(record: dict[str, Any]) -> datetime:
         return datetime.strptime(Path(record["train"]["config_path"]).parent.name, "%Y-%m-%d_%H%M%S")
 
-    ours, theirs = row_of(run), row_of(base)
-    return [
+    ours, theirs = (bench_rows("speed")["bonsai", "own", name] for name in (run, base))
+    ratios = [
         ours.values[column][seed] / theirs.values[column][other]
         for seed, one in ours.records.items()
         for other, two in theirs.records.items()
         if abs(began(one) - began(two)) < SITTING
     ]
+    return f"{median(ratios):.2f}"
 
 
 def spread(*runs: str) -> str:
     """By how much the slowest training of a run is above its fastest, at most."""
-    return f"{100 * max(max(times) / min(times) - 1 for times in (values('time s', run) for run in runs)):.0f} %"
+    every = [bench_rows("speed")["bonsai", "own", run].values["time s"].values() for run in runs]
+    return f"{100 * max(max(times) / min(times) - 1 for times in every):.0f} %"
 
 
 # The choice between methods and presets.
@@ -139,20 +131,9 @@ def scale_spread() -> str:
 
 
 BLOCKS = {
-    **{f"speed.{block.__name__}": block for block in (scale_fit, scale_frames, scale_ratio, scale_spread, spread)},
-    "speed.ratio": lambda column, run, base: f"{median(_ratios(column, run, base)):.2f}",
-    "trade_off.presets": presets,
-    "trade_off.gain": gain,
-    "trade_off.time": time,
-    "nerfstudio.methods": lambda: table(
-        "method | description | memory (bonsai, 799 x 532) | time for 30,000 steps (H200)",
-        {"`nrfgs`": "nrfgs", "`nrfgs-sh`": "nrfgs-sh", "`splatfacto`": "splatfacto"},
-        {
-            "nrfgs": "the method",
-            "nrfgs-sh": "the same model with spherical harmonics (3DGS)",
-            "splatfacto": "nerfstudio's own, for comparison",
-        }.get,
-        lambda run: f"{median(values('peak MB', run)) / 1000:.1f} GB",
-        lambda run: f"{median(values('time s', run)):.1f} s",
-    ),
+    **{
+        f"speed.{block.__name__}": block
+        for block in (ratio, scale_fit, scale_frames, scale_ratio, scale_spread, spread)
+    },
+    **{f"trade_off.{one.__name__}": one for one in (presets, gain, time)},
 }

@@ -21,7 +21,7 @@ from typing import Any
 import yaml
 
 from nrfgs_lab.pages import appendix, few_views, files, methods, others, speed
-from nrfgs_lab.pages.runs import ROOT, grid, records, signed
+from nrfgs_lab.pages.runs import ROOT, bench_rows, grid, records, signed
 
 OPENING = "<!-- table "
 BLOCK = re.compile(r"<!-- table (\w+\.\w+)(\([^\n]*?\))? -->(.*?)<!-- end -->", re.DOTALL)
@@ -73,35 +73,18 @@ def rendered(block: Any) -> str:
     """A block as Markdown."""
     if isinstance(block, str):
         return filled(block)
-    columns = block.get("columns", [None])
-    lines = []
+    body = []
     for label, row in block["rows"].items():
-        cells = block.get("cells", row)
+        texts = row
         if "cell" in block:
-            cells = [row if isinstance(row, str) and "{" in row else block["cell"]] * len(columns)
-        places = columns if len(columns) > 1 else columns * len(cells)
-        cells = [filled(one, row, place, "-") for one, place in zip(cells, places, strict=True)]
-        lines.append([label, *cells])
-    return grid([title.strip() for title in filled(block["head"]).split("|")], lines)
+            texts = [block["cell"].replace("$row", row).replace("$column", column) for column in block["columns"]]
+        body.append([label, *map(filled, texts)])
+    return grid([title.strip() for title in filled(block["head"]).split("|")], body)
 
 
-def filled(template: str, row: Any = None, column: Any = None, missing: str | None = None) -> str:
-    """A template with its numbers.
-
-    Args:
-        row, column: what `$row` and `$column` stand for; of a list, `$row[0]` is the first.
-        missing: the whole text if a record lacks a number; None: that is an error.
-    """
-    for name, value in (("row", row), ("column", column)):
-        for number, part in enumerate(value if isinstance(value, list) else ()):
-            template = template.replace(f"${name}[{number}]", str(part))
-        template = template.replace(f"${name}", str(value))
-    try:
-        return re.sub(r"\{([^{}]*):([^{}:]*)\}", lambda match: formatted(term(match[1]), match[2]), template)
-    except LookupError:
-        if missing is None:
-            raise
-        return missing
+def filled(template: str) -> str:
+    """A template with its numbers."""
+    return re.sub(r"\{([^{}]*):([^{}:]*)\}", lambda match: formatted(term(match[1]), match[2]), template)
 
 
 def term(words: str) -> Any:
@@ -119,6 +102,8 @@ def single(words: str) -> Any:
     if not path:
         return float(study)
     value: Any = records(study)
+    if path[0] == "rows":  # of a benchmark: SCENE/STRATEGY/RUN, column, seed
+        value, path = {"/".join(place): row.values for place, row in bench_rows(study).items()}, path[1:]
     for key in path:
         value = step(value, key)
     return value
@@ -130,20 +115,12 @@ def step(value: Any, key: str) -> Any:
         return value[key]
     what, _, inner = key.partition(" ")
     if what in AGGREGATES:
-        return AGGREGATES[what]([entry(one, inner) for one in (value.values() if isinstance(value, dict) else value)])
+        every = value.values() if isinstance(value, dict) else value
+        return AGGREGATES[what]([step(one, inner) if inner else one for one in every])
     if isinstance(value, list) and "=" in key:
         pairs = [pair.split("=") for pair in key.split("&")]
-        chosen = [one for one in value if all(str(one[name]) == wanted for name, wanted in pairs)]
-        return chosen[0]
+        return next(one for one in value if all(str(one[name]) == wanted for name, wanted in pairs))
     return value[int(key)] if isinstance(value, list) else value[key]
-
-
-def entry(value: Any, key: str) -> Any:
-    """The entry of an element: itself for an empty key, or the difference of two, "A less B"."""
-    if " less " in key:
-        one, other = (entry(value, part) for part in key.split(" less "))
-        return one - other
-    return value if not key else value[int(key)] if isinstance(value, list) else value[key]
 
 
 def formatted(value: Any, form: str) -> str:

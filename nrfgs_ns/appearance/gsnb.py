@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from nrfgs_ns.appearance.encoding import BAND_DIM, NEAREST, fourier_bands, unit_vectors
-from nrfgs_ns.appearance.head import SplatAppearance
+from nrfgs_ns.appearance.head import SplatAppearance, layers
 from nrfgs_ns.appearance.sh import ShConfig, SphericalHarmonics, eval_sh, num_bases
 
 RAMP_STEPS = 5000
@@ -51,14 +51,8 @@ class NeuralBasis(SphericalHarmonics):
         super().__init__(config)
         self.ramp = 1.0
         """rho: weight of the learnt basis."""
-        self.basis = nn.Sequential(
-            nn.Linear(3 * config.raw_direction + BAND_DIM * BANDS, HIDDEN_WIDTH),
-            nn.LeakyReLU(),
-            nn.Linear(HIDDEN_WIDTH, HIDDEN_WIDTH),
-            nn.LeakyReLU(),
-            nn.Linear(HIDDEN_WIDTH, num_bases(config.degree)),
-            nn.Tanh(),
-        )
+        inputs = 3 * config.raw_direction + BAND_DIM * BANDS
+        self.basis = nn.Sequential(*layers(inputs, HIDDEN_WIDTH, HIDDEN_WIDTH, num_bases(config.degree)), nn.Tanh())
 
     def set_step(self, step: int) -> None:
         super().set_step(step)

@@ -27,7 +27,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from nrfgs_ns.kernels.trial import Gate
+from nrfgs_ns.kernels.trial import tried_once
 
 PRIMES = (1, 2654435761, 805459861)
 """The hash's multipliers for x, y, z; `hash_grid_triton.py` repeats them."""
@@ -97,16 +97,10 @@ def _corners(per_axis: Tensor, combine: Callable[[Tensor, Tensor], Tensor]) -> T
     return combine(xy[..., :, :, None], z[..., None, None, :]).flatten(-3)
 
 
-_GATE = Gate("The hash grid")
+@tried_once("The hash grid")
+def kernels_run_on(device: torch.device) -> None:
+    """Whether Triton's kernels run on a CUDA device."""
+    from nrfgs_ns.appearance.hash_grid_triton import Interpolation
 
-
-def kernels_run_on(device: torch.device) -> bool:
-    """Whether Triton's kernels run on a CUDA device; tried once, which compiles them."""
-
-    def trial() -> None:
-        from nrfgs_ns.appearance.hash_grid_triton import Interpolation
-
-        position, table = (torch.zeros(*shape, device=device, requires_grad=True) for shape in ((1, 3), (2, FEATURES)))
-        Interpolation.apply(position, table, torch.ones(1, device=device), 0, 2).sum().backward()
-
-    return _GATE.opens(device, device, trial)
+    position, table = (torch.zeros(*shape, device=device, requires_grad=True) for shape in ((1, 3), (2, FEATURES)))
+    Interpolation.apply(position, table, torch.ones(1, device=device), 0, 2).sum().backward()

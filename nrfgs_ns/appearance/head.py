@@ -9,6 +9,7 @@ does not depend on the view (`base_appearance`). Shared weights are the head's o
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import torch
@@ -157,6 +158,12 @@ class AppearanceHead(nn.Module, ABC):
     def neutral_loss(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> Tensor | None:
         """Mean squared residual, a scalar to minimise in the warm-up; None without shared weights to train."""
         return None
+
+
+def layers(*widths: int) -> list[nn.Module]:
+    """Linear layers between these widths, with leaky ReLUs between them."""
+    pairs = [(nn.Linear(*sizes), nn.LeakyReLU()) for sizes in pairwise(widths)]
+    return [layer for pair in pairs for layer in pair][:-1]
 
 
 def base_opacities(logits: Tensor) -> Tensor:

@@ -60,27 +60,26 @@ def latent_basis(field: Field, weight: Tensor) -> LatentBasis:
 
 def with_rank(field: Field, basis: LatentBasis, rank: int) -> Field:
     """Latents of `rank` numbers, 1..D: their first principal components, folded into the first layer."""
-    latents, weights = field.splats["latents"], dict(field.head.state_dict())
-    size = latents.shape[1]
-    for branch in branches(weights):
-        first = weights[f"{branch}.0.weight"].double()
-        of_latents, others = first[:, :size], first[:, size:]
-        weights[f"{branch}.0.weight"] = torch.cat([of_latents @ basis.axes[:, :rank], others], dim=1)
-        weights[f"{branch}.0.bias"] = weights[f"{branch}.0.bias"].double() + of_latents @ basis.mean
-    reduced = (latents.detach().double() - basis.mean) @ basis.inverse[:rank].T
-    field = Field(field.head, {**field.splats, "latents": reduced.to(latents.dtype)})
-    return rebuilt(field, weights, latent_dim=rank)
+    reduced = (field.splats["latents"].detach().double() - basis.mean) @ basis.inverse[:rank].T
+    return _folded(field, reduced, basis.axes[:, :rank], basis.mean)
 
 
 def with_components(field: Field, columns: Tensor) -> Field:
     """Only these components of the latents, [R], at least one; the others are 0 for every splat."""
+    latents = field.splats["latents"].detach().double()
+    axes = torch.eye(latents.shape[1]).to(latents)[:, columns]
+    return _folded(field, latents[:, columns], axes, axes.new_zeros(len(axes)))
+
+
+def _folded(field: Field, reduced: Tensor, axes: Tensor, mean: Tensor) -> Field:
+    """The same field of the latents y [N, R] with z = mean + axes y, all float64."""
     latents, weights = field.splats["latents"], dict(field.head.state_dict())
-    size = latents.shape[1]
     for branch in branches(weights):
-        first = weights[f"{branch}.0.weight"]
-        weights[f"{branch}.0.weight"] = torch.cat([first[:, :size][:, columns], first[:, size:]], dim=1)
-    field = Field(field.head, {**field.splats, "latents": latents[:, columns]})
-    return rebuilt(field, weights, latent_dim=len(columns))
+        of_latents, others = weights[f"{branch}.0.weight"].double().tensor_split([len(axes)], dim=1)
+        weights[f"{branch}.0.weight"] = torch.cat([of_latents @ axes, others], dim=1)
+        weights[f"{branch}.0.bias"] = weights[f"{branch}.0.bias"].double() + of_latents @ mean
+    smaller = Field(field.head, {**field.splats, "latents": reduced.to(latents.dtype)})
+    return rebuilt(smaller, weights, latent_dim=axes.shape[1])
 
 
 def branches(weights: Mapping[str, Tensor]) -> list[str]:

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig, SplatAppearance, base_opacities
-from nrfgs_ns.kernels.trial import Gate
+from nrfgs_ns.kernels.trial import tried_once
 
 
 @dataclass
@@ -140,18 +140,12 @@ def eval_sh(degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
     return torch.einsum("mb,mbc->mc", bases, coefficients[:, : num_bases(degree)])
 
 
-_GATE = Gate("Spherical harmonics")
+@tried_once("Spherical harmonics")
+def kernels_run_on(device: torch.device) -> None:
+    """Whether Triton's kernels run on a CUDA device."""
+    from nrfgs_ns.appearance.harmonics_triton import Harmonics
 
-
-def kernels_run_on(device: torch.device) -> bool:
-    """Whether Triton's kernels run on a CUDA device; tried once, which compiles them."""
-
-    def trial() -> None:
-        from nrfgs_ns.appearance.harmonics_triton import Harmonics
-
-        direction = torch.ones(1, 3, device=device, requires_grad=True)
-        coefficients = torch.ones(1, 16, 3, device=device, requires_grad=True)
-        for degree in range(4):
-            Harmonics.apply(degree, direction, coefficients).sum().backward()
-
-    return _GATE.opens(device, device, trial)
+    direction = torch.ones(1, 3, device=device, requires_grad=True)
+    coefficients = torch.ones(1, 16, 3, device=device, requires_grad=True)
+    for degree in range(4):
+        Harmonics.apply(degree, direction, coefficients).sum().backward()

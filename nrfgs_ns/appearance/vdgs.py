@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from nrfgs_ns.appearance.encoding import NEAREST, unit_vectors
 from nrfgs_ns.appearance.hash_grid import HashGrid, kernels_run_on
-from nrfgs_ns.appearance.head import Component, SplatAppearance
+from nrfgs_ns.appearance.head import Component, SplatAppearance, layers
 from nrfgs_ns.appearance.sh import ShConfig, SphericalHarmonics, eval_sh
 
 HIDDEN_WIDTH = 32
@@ -51,13 +51,7 @@ class ViewDirectionFactors(SphericalHarmonics):
     def __init__(self, config: VdgsConfig):
         super().__init__(config)
         self.grid = HashGrid(config.grid_base_resolution)
-        self.network = nn.Sequential(
-            nn.Linear(3 + self.grid.width, HIDDEN_WIDTH),
-            nn.LeakyReLU(),
-            nn.Linear(HIDDEN_WIDTH, HIDDEN_WIDTH),
-            nn.LeakyReLU(),
-            nn.Linear(HIDDEN_WIDTH, 1),
-        )
+        self.network = nn.Sequential(*layers(3 + self.grid.width, HIDDEN_WIDTH, HIDDEN_WIDTH, 1))
 
     def try_kernels(self, device: torch.device) -> None:
         super().try_kernels(device)

@@ -168,9 +168,7 @@ def _fitted_prediction(left_2: Array, left: Array, own: Array, real: Array) -> t
     inputs = [own[1:-1], own[:-2], left[2:], left[1:-1], left_2[2:], left_2[1:-1]]
     fit = _least_squares(inputs, own[2:], real, 1e-6 / (1 + PREDICTORS), 1e-9)
     weights = np.rint(fit * (1 << SHIFT)).clip(-LARGEST_WEIGHT, LARGEST_WEIGHT).astype(np.int64)
-    total = weights[0] + (1 << (SHIFT - 1))
-    for weight, neighbours in zip(weights[1:], inputs, strict=True):
-        total = total + weight * neighbours
+    total = weights[0] + (1 << (SHIFT - 1)) + np.tensordot(weights[1:], inputs, 1)
     return weights.tolist(), total >> SHIFT
 
 
@@ -181,7 +179,7 @@ def _fitted_contexts(left_2: Array, left: Array, own: Array, real: Array) -> tup
         return [0] * ACTIVITY, [], np.zeros_like(own)
     fit = _least_squares(neighbours, own, real, 1e-6, 1e-6)[1:]
     shares = np.rint(LARGEST_SHARE * fit.clip(0, None) / max(fit.max(), 1e-9)).astype(np.int64).clip(0, LARGEST_SHARE)
-    activity = sum(share * values for share, values in zip(shares, neighbours, strict=True))
+    activity = np.tensordot(shares, neighbours, 1)
     counts = np.bincount((activity * TOKENS + own)[real], minlength=(MOST_ACTIVITY + 1) * TOKENS)
     counts = counts.reshape(MOST_ACTIVITY + 1, TOKENS)
     levels = np.flatnonzero(counts.any(axis=1))

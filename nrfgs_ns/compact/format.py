@@ -64,17 +64,8 @@ ONE_BLOCK = b"\x02\x00\x21\x01"
 """How the header of a block begins: its length, no sizes, LZMA2, one byte of properties."""
 ENTRY = ("name", "coding", "dtype", "shape", "bytes", "crc32")
 """Keys of an entry of "streams"."""
-BROKEN = (
-    OSError,
-    LookupError,
-    TypeError,
-    ValueError,
-    AttributeError,
-    OverflowError,
-    RuntimeError,
-    lzma.LZMAError,
-    struct.error,
-)
+BROKEN = OSError, LookupError, TypeError, ValueError, AttributeError, OverflowError, RuntimeError
+BROKEN += lzma.LZMAError, struct.error
 """Errors of reading a damaged or hostile file."""
 
 

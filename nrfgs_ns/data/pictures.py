@@ -121,14 +121,13 @@ def in_parallel(
 
     width, height = max(sizes, key=math.prod, default=(1, 1))
     each, free = BYTES_PER_PIXEL * width * height, free_memory()
-    workers = workers or os.cpu_count() or 1
     if each > free:
         raise InputError(
             f"Decoding an image of {width} x {height} takes about {each / 1e9:.1f} GB of memory, and {free / 1e9:.1f} "
             "are free. Close other programs, or make the images and masks smaller."
         )
-    workers = max(int(min(workers, free / (2 * each + 1))), 1)
-    with ThreadPoolExecutor(workers) as pool:
+    workers = min(workers or os.cpu_count() or 1, free / (2 * each + 1))
+    with ThreadPoolExecutor(max(int(workers), 1)) as pool:
         try:
             yield from track(pool.map(read, range(len(sizes))), what, len(sizes), console=CONSOLE, transient=True)
         except BaseException:

@@ -20,19 +20,8 @@ from nrfgs_ns.densification.mcmc import Mcmc
 from nrfgs_ns.densification.strategy import CHANGE, UNSEEN, Densification, DensificationConfig
 from nrfgs_ns.errors import InputError
 
-__all__ = [
-    "CHANGE",
-    "STRATEGIES",
-    "UNSEEN",
-    "Densification",
-    "DensificationChoice",
-    "DensificationConfig",
-    "ErrorGuided",
-    "Mcmc",
-    "Original",
-    "Splatfacto",
-    "strategy_from",
-]
+__all__ = ["CHANGE", "STRATEGIES", "UNSEEN", "Densification", "DensificationChoice", "DensificationConfig"]
+__all__ += ["ErrorGuided", "Mcmc", "Original", "Splatfacto", "strategy_from"]
 
 STRATEGIES: dict[str, type[DensificationConfig]] = {
     config.name: config for config in (Splatfacto, Original, Mcmc, ErrorGuided)

@@ -19,7 +19,7 @@ wide splats are split and not replaced, and no noise moves the means. The loss h
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -66,6 +66,7 @@ class ErrorGuided(DensificationConfig):
     """Growth where the error is: the number of splats follows from the capture."""
 
     name: ClassVar[str] = "error-guided"
+    counts: ClassVar[tuple[str, ...]] = ("budget", "most_splats")
     copies_splats: ClassVar[bool] = True
     opacity_seen: OpacitySeen = "peak"
     """opacity by which splats are dead (docs/deviations.md). base: stored. peak: largest shown in two windows"""
@@ -90,10 +91,6 @@ class ErrorGuided(DensificationConfig):
         super().check()
         self.require(self.most_splats >= 1, "most_splats", "at least 1")
         self.require(self.budget <= self.most_splats, "budget", f"at most most_splats, {self.most_splats}")
-
-    def share_of(self, rank: int, devices: int) -> "ErrorGuided":
-        shares = {name: len(range(rank, getattr(self, name), devices)) for name in ("budget", "most_splats")}
-        return replace(self, **shares)
 
     def build(self, num_images: int, num_views: int, scene_unit: float) -> "ErrorGuidedDensification":
         return ErrorGuidedDensification(self, self.threshold * (1 + (num_views / MANY_VIEWS) ** 2))

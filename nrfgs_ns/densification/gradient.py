@@ -3,7 +3,7 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -34,6 +34,7 @@ STRATEGY_BOUNDS = ("refine_start_iter", "refine_stop_iter", "refine_scale2d_stop
 class GradientConfig(DensificationConfig):
     """Options that splatfacto's and 3DGS's rules share."""
 
+    counts: ClassVar[tuple[str, ...]] = ("budget",)
     stop_split_at: int = 15_000
     """step at which growth ends"""
     reset_alpha_every: int = 30
@@ -55,9 +56,6 @@ class GradientConfig(DensificationConfig):
             **thresholds,
         )
         return GradientDensification(self.name, rules, self.opacity_seen, scene_unit, self.budget)
-
-    def share_of(self, rank: int, devices: int) -> "GradientConfig":
-        return replace(self, budget=len(range(rank, self.budget, devices)))
 
 
 @dataclass

@@ -2,7 +2,7 @@
 """3DGS-MCMC (Kheradmand et al. 2024): nothing is deleted, dead splats move to live ones, noise explores."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -36,6 +36,7 @@ class Mcmc(DensificationConfig):
     name: ClassVar[str] = "mcmc"
     copies_splats: ClassVar[bool] = True
     regularises: ClassVar[bool] = True
+    counts: ClassVar[tuple[str, ...]] = ("budget",)
     opacity_seen: OpacitySeen = "peak"
     """opacity by which splats are pruned or moved (docs/deviations.md). base: stored. peak: largest shown since the
     last refinement"""
@@ -49,9 +50,6 @@ class Mcmc(DensificationConfig):
     def check(self) -> None:
         super().check()
         self.require(1 <= self.budget <= LARGEST_BUDGET, "budget", f"from 1 to {LARGEST_BUDGET}")
-
-    def share_of(self, rank: int, devices: int) -> "Mcmc":
-        return replace(self, budget=len(range(rank, self.budget, devices)))
 
     def build(self, num_images: int, num_views: int, scene_unit: float) -> "McmcDensification":
         return McmcDensification(self, scene_unit)

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nrfgs_ns.kernels.trial import Gate
+from nrfgs_ns.kernels.trial import tried_once
 
 
 def take_statistics(state: Mapping[str, Tensor], info: Mapping[str, Any], gradients: Tensor) -> None:
@@ -111,9 +111,6 @@ def raise_in_torch(
         changes.scatter_reduce_(0, rows, change.where(seen, -math.inf), "amax")
 
 
-_GATE = Gate("What densification remembers")
-
-
 def _kernels_take(info: Mapping[str, Any], *tensors: Tensor) -> bool:
     """Whether a kernel does it. Where one camera looks, no row of the state occurs twice."""
     device = tensors[0].device
@@ -125,13 +122,9 @@ def _kernels_take(info: Mapping[str, Any], *tensors: Tensor) -> bool:
     )
 
 
-def try_kernel(device: torch.device) -> bool:
-    """Whether the kernels run on a CUDA device; tried once, which compiles them: the first step would."""
-    return _GATE.opens(device, device, lambda: _try_kernels(device))
-
-
-def _try_kernels(device: torch.device) -> None:
-    """Compile and run the kernels on one splat; raise whatever goes wrong."""
+@tried_once("What densification remembers")
+def try_kernel(device: torch.device) -> None:
+    """Whether the kernels run on a CUDA device; the first step would compile them."""
     from nrfgs_ns.densification.statistics_triton import add, raise_maxima
 
     row, one = torch.zeros(1, dtype=torch.int64, device=device), torch.ones(1, device=device)

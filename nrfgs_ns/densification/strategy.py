@@ -8,7 +8,7 @@ wants of the head or of the loss it says itself. A new one is one file, and its 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, MutableMapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
@@ -84,6 +84,8 @@ class DensificationConfig(ABC):
     """adds terms for opacity and size to the loss, in place of the model's `shrinkage`"""
     shrinkage: ClassVar[float] = 0.0
     """weight that it adds to the model's `shrinkage`, in percent, however many training views there are"""
+    counts: ClassVar[tuple[str, ...]] = ()
+    """options that are numbers of splats"""
     opacity_seen: OpacitySeen = "base"
     """opacity by which splats are pruned or moved (docs/deviations.md). base: stored. peak: largest shown since the
     last refinement"""
@@ -120,7 +122,7 @@ class DensificationConfig(ABC):
 
     def share_of(self, rank: int, devices: int) -> "DensificationConfig":
         """The options for one of several devices, each of which has a part of the splats."""
-        return self
+        return replace(self, **{name: len(range(rank, getattr(self, name), devices)) for name in self.counts})
 
     def __str__(self) -> str:
         """The option's value on the command line: the name, then options that are not at their defaults."""

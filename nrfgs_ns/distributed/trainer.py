@@ -181,13 +181,10 @@ class ShardedOptimizers(LeanOptimizers):
 
     def load_optimizers(self, loaded_state: dict[str, Any]) -> None:
         """Load this device's rows of a whole checkpoint; the model has been loaded."""
-        model = self.model
-        super().load_optimizers(
-            {
-                name: map_moments(state, lambda table: table[model.loaded]) if name in model.gauss_params else state
-                for name, state in loaded_state.items()
-            }
-        )
+        own = dict(loaded_state)
+        for name in self.model.gauss_params:
+            own[name] = map_moments(own[name], lambda table: table[self.model.loaded])
+        super().load_optimizers(own)
 
 
 class ShardedTrainer(NrfgsTrainer):

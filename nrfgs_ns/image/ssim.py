@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nrfgs_ns.image.metrics import LIBRARY, SSIM_C1, SSIM_C2, WEIGHTS, WINDOW_SIZE, blur
-from nrfgs_ns.kernels.trial import Gate
+from nrfgs_ns.kernels.trial import tried_once
 
 MAX_NUMBERS = 2**31
 """The kernels index slopes with 32 bits: three slopes of an image must have fewer numbers."""
@@ -80,15 +80,9 @@ def _similarity(x: Tensor, y: Tensor, xx: Tensor, yy: Tensor, xy: Tensor) -> tup
     return S, by_x, by_xx, by_xy
 
 
-_GATE = Gate("SSIM")
-
-
-def kernels_run_on(device: torch.device) -> bool:
-    """Whether Triton's kernels run on a CUDA device; tried once, which compiles them."""
-    return _GATE.opens(device, device, lambda: _try_kernels(device))
-
-
-def _try_kernels(device: torch.device) -> None:
+@tried_once("SSIM")
+def kernels_run_on(device: torch.device) -> None:
+    """Whether Triton's kernels run on a CUDA device."""
     from nrfgs_ns.image.ssim_triton import WeightedSum
 
     image = torch.zeros(WINDOW_SIZE, WINDOW_SIZE, 3, device=device, requires_grad=True)

@@ -9,6 +9,7 @@ import logging
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
+from functools import partial, wraps
 from typing import Any, TypeVar
 
 import torch
@@ -70,6 +71,20 @@ class Gate(dict[Hashable, Any]):
     def opens(self, key: Hashable, device: torch.device, trial: Callable[[], object]) -> bool:
         """Whether the kernels run."""
         return not isinstance(self.find(key, device, trial), str)
+
+
+def tried_once(what: str) -> Callable[[Callable[[torch.device], object]], Callable[[torch.device], bool]]:
+    """Turn a trial of kernels into the question whether they run on a device: it is tried once, which compiles them.
+
+    Args:
+        what: as `Gate`'s.
+    """
+    gate = Gate(what)
+
+    def question(trial: Callable[[torch.device], object]) -> Callable[[torch.device], bool]:
+        return wraps(trial)(lambda device: gate.opens(device, device, partial(trial, device)))
+
+    return question
 
 
 def _tried(trial: Callable[[], Outcome]) -> Outcome | str:

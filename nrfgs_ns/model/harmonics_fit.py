@@ -121,10 +121,7 @@ class Moments:
         self.gram = zeros(self.upper.shape[1])  # sum w Y_a Y_b for a <= b
         self.target = zeros(BASES, 3)  # sum w Y residual
         self.power = zeros()  # sum w |residual|^2
-        self.weight = zeros()
-        self.weight_squared = zeros()
-        self.opacity = zeros()
-        self.views = zeros()
+        self.weight, self.weight_squared, self.opacity, self.views = (zeros() for _ in range(4))
 
     def add(self, seen: Observations) -> None:
         """Add a view, in which no row occurs twice."""

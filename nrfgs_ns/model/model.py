@@ -238,9 +238,8 @@ class NrfgsModel(SplatfactoModel):
     @torch.no_grad()
     def get_base_color(self, camera: Cameras) -> Tensor:
         """The image [H, W, 3] of the base colours and opacities alone."""
-        field = self.field
-        view = self.project(camera, field.splats)
-        return self.composite(view, field.base_of(view))[0]["rgb"]
+        view = self.project(camera)
+        return self.composite(view, self.field.base_of(view))[0]["rgb"]
 
     # Training.
 
@@ -342,11 +341,9 @@ class NrfgsModel(SplatfactoModel):
 
         A metric without a value (LPIPS without its weights, MS-SSIM of a small image) is left out.
         """
-        truth = self.truth_of(batch, outputs["background"])
-        rgb = outputs["rgb"]
-        metrics = image_metrics(rgb, truth, self.mask_of(batch))
-        metrics = {name: value for name, value in metrics.items() if value is not None}
-        return metrics, {"img": torch.cat([truth, rgb], dim=1)}
+        rgb, truth = outputs["rgb"], self.truth_of(batch, outputs["background"])
+        metrics = image_metrics(rgb, truth, self.mask_of(batch)).items()
+        return {name: value for name, value in metrics if value is not None}, {"img": torch.cat([truth, rgb], dim=1)}
 
     # Viewer and exporter. The exporter reads splats with spherical harmonics from the properties below. After `fit_on`,
     # which neither a training nor a viewer calls, they are harmonics fitted to the head (`harmonics_fit.py`).
@@ -376,12 +373,16 @@ class NrfgsModel(SplatfactoModel):
         """The fitted harmonics; None without `fit_on`."""
         return None if self._fit is None else self._fit()
 
-    def _exported(self, name: str) -> Tensor:
-        return self.gauss_params[name] if self.fit is None else getattr(self.fit.splats, name)
+    def _exported(self, name: str, *missing: int) -> Tensor:
+        """A splat's numbers as a file has them; of a head without them zeros [N, *missing]."""
+        if self.fit is not None:
+            return getattr(self.fit.splats, name)
+        stored = self.gauss_params.get(name)
+        return self.means.new_zeros(self.num_points, *missing) if stored is None else stored
 
     @property
     def colors(self) -> Tensor:
-        return base_colors(self.shs_0)
+        return base_colors(self.features_dc)
 
     @property
     def opacities(self) -> Tensor:
@@ -392,26 +393,18 @@ class NrfgsModel(SplatfactoModel):
         return self._exported("quats")
 
     @property
-    def shs_0(self) -> Tensor:
-        return self.features_dc if self.fit is None else self.fit.splats.features_dc
-
-    @property
-    def shs_rest(self) -> Tensor:
-        """Coefficients of the higher harmonics [N, B, 3]; B = 0 for a head without any, unless they are fitted."""
-        return self.features_rest if self.fit is None else self.fit.splats.features_rest
-
-    @property
     def features_dc(self) -> Tensor:
-        """The stored coefficients of the constant harmonic [N, 3]; of a head without them zeros, mid grey."""
-        stored = self.gauss_params.get("features_dc")
-        return self.means.new_zeros(self.num_points, 3) if stored is None else stored
+        """The coefficients of the constant harmonic [N, 3]; of a head without them zeros, mid grey."""
+        return self._exported("features_dc", 3)
 
     @property
     def features_rest(self) -> Tensor:
-        """The stored coefficients of the higher harmonics [N, B, 3]; B = 0 for a head without any."""
-        if "features_rest" in self.gauss_params:
-            return self.gauss_params["features_rest"]
-        return self.features_dc.new_zeros(self.num_points, 0, 3)
+        """Coefficients of the higher harmonics [N, B, 3]; B = 0 for a head without any, unless they are fitted."""
+        return self._exported("features_rest", 0, 3)
+
+    @property
+    def shs_0(self) -> Tensor:
+        return self.features_dc
 
     # Checkpoints.
 

@@ -15,7 +15,7 @@ from gsplat import fully_fused_projection, isect_offset_encode, isect_tiles, ras
 from torch import Tensor
 
 from nrfgs_ns.host import GSPLAT, gsplat_version
-from nrfgs_ns.kernels.trial import Gate
+from nrfgs_ns.kernels.trial import tried_once
 
 from . import EPS2D, TILE_SIZE, Projection, ProjectionOptions
 
@@ -179,9 +179,6 @@ def _lists(
     return isect_offset_encode(isect_ids, projection.n_cameras, tile_width, tile_height), flatten_ids
 
 
-_GATE = Gate("The list of each tile's splats")
-
-
 def _kernels_take(projection: Projection, opacities: Tensor) -> bool:
     """Whether the kernels of `tile_lists.py` make the lists."""
     tiles = -(-projection.width // TILE_SIZE) * (-(-projection.height // TILE_SIZE) + 1)
@@ -193,13 +190,9 @@ def _kernels_take(projection: Projection, opacities: Tensor) -> bool:
     )
 
 
-def _kernels_run_on(device: torch.device) -> bool:
-    """Whether the kernels of `tile_lists.py` run on a device; tried once."""
-    return _GATE.opens(device, device, lambda: _try_kernels(device))
-
-
-def _try_kernels(device: torch.device) -> None:
-    """Compile and run both kernels on one splat."""
+@tried_once("The list of each tile's splats")
+def _kernels_run_on(device: torch.device) -> None:
+    """Whether the kernels of `tile_lists.py` run on a device."""
     from .tile_lists import tile_lists
 
     ones = torch.ones(1, 3, device=device)

@@ -104,8 +104,7 @@ def load_file(path: Path) -> "NrfgsModel":
     )
     model.load_state_dict(model_state(model, decoded))
     model.background_color = torch.tensor(background, dtype=torch.float32)
-    model.to("cuda" if torch.cuda.is_available() else "cpu")
-    return model.eval()
+    return model.to("cuda" if torch.cuda.is_available() else "cpu").eval()
 
 
 @torch.no_grad()

@@ -79,17 +79,13 @@ class Guard:
     """Watches one training."""
 
     def __init__(self, pipeline):
-        self.pipeline = pipeline
+        self.pipeline, self.model = pipeline, pipeline.model
         self.step = 0
         self.blind_steps = 0
         self._verdict: Verdict | None = None
         # Pinned memory and events are expensive to make; one of each suffices, since a verdict is read before the next.
         self._in_host_memory: Tensor | None = None
         self._arrival: torch.cuda.Event | None = None
-
-    @property
-    def model(self):
-        return self.pipeline.model
 
     def begin(self, step: int, optimizers: LeanOptimizers, settled_later: bool = False) -> None:
         """Read the verdict on the step before, and now and then check the parameters. Raises TrainingStopped.

@@ -17,7 +17,7 @@ from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from nrfgs_ns.kernels.trial import Gate
+from nrfgs_ns.kernels.trial import tried_once
 from nrfgs_ns.training.pace import Pace
 
 
@@ -100,14 +100,9 @@ class LeanOptimizers(Optimizers):
 
     def load_optimizers(self, loaded_state) -> None:
         """Load the moments; options such as learning rates stay this training's."""
-        own = {
-            name: [{key: value for key, value in group.items() if key != "params"} for group in optimizer.param_groups]
-            for name, optimizer in self.optimizers.items()
-        }
-        super().load_optimizers(loaded_state)
-        for name, optimizer in self.optimizers.items():
-            for group, options in zip(optimizer.param_groups, own[name], strict=True):
-                group.update(options)
+        for name, state in loaded_state.items():
+            own = self.optimizers[name].state_dict()["param_groups"]
+            self.optimizers[name].load_state_dict({**state, "param_groups": own})
         self.fuse()
 
     def load_schedulers(self, loaded_state) -> None:
@@ -123,7 +118,6 @@ class LeanOptimizers(Optimizers):
                 group["lr"] = rate
 
 
-_GATE = Gate("Adam")
 _TABLES: dict[torch.device, Any] = {}
 
 
@@ -153,20 +147,17 @@ def step_at_once(optimizers: Sequence[Adam]) -> bool:
     return done
 
 
-def try_kernel(device: torch.device) -> bool:
-    """Whether Adam's kernel runs on a CUDA device; tried once, which compiles it: the first step would."""
+@tried_once("Adam")
+def try_kernel(device: torch.device) -> None:
+    """Whether Adam's kernel runs on a CUDA device; the first step would compile it."""
+    from nrfgs_ns.training.adam_triton import AdamTable
 
-    def trial() -> None:
-        from nrfgs_ns.training.adam_triton import AdamTable
-
-        number = Parameter(torch.ones(1, device=device))
-        number.grad = torch.ones_like(number)
-        state = {name: torch.ones(1, device=device) for name in ("exp_avg", "exp_avg_sq", "step")}
-        group = {"lr": 0.1, "betas": (0.9, 0.999), "eps": 1e-15, "weight_decay": 0.0}
-        with torch.no_grad():
-            AdamTable(device).step([(group, [number], [state])], None)
-
-    return _GATE.opens(device, device, trial)
+    number = Parameter(torch.ones(1, device=device))
+    number.grad = torch.ones_like(number)
+    state = {name: torch.ones(1, device=device) for name in ("exp_avg", "exp_avg_sq", "step")}
+    group = {"lr": 0.1, "betas": (0.9, 0.999), "eps": 1e-15, "weight_decay": 0.0}
+    with torch.no_grad():
+        AdamTable(device).step([(group, [number], [state])], None)
 
 
 def parameters_of(optimizer: Optimizer) -> list[Tensor]:

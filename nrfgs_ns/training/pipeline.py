@@ -16,7 +16,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import track
-from rich.table import Table
+from rich.table import Column, Table
 from torchvision.utils import save_image
 
 from nrfgs_ns.compact.decode import decode, model_state
@@ -213,9 +213,7 @@ def print_evaluation(result: Mapping[str, Any]) -> None:
     views = result["per_image"]
     title = "One test view: not a mean, and no measure of the whole"
     CONSOLE.print(title if len(views) == 1 else f"Means over {len(views)} test views", soft_wrap=True)
-    table = Table()
-    for name in names:
-        table.add_column(name, justify="right")
+    table = Table(*(Column(name, justify="right") for name in names))
     table.add_row(*(f"{result[name]:,}" if name == "splats" else f"{result[name]:.4g}" for name in names))
     CONSOLE.print(table)
     known = sorted((view["psnr"], view["image"]) for view in views if view.get("psnr") is not None)

@@ -16,7 +16,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.utils.writer import EventName, LocalWriter
 from rich.live import Live
 from rich.progress_bar import ProgressBar
-from rich.table import Table
+from rich.table import Column, Table
 from tyro.conf import Suppress
 
 from nrfgs_ns.image.metrics import psnr
@@ -126,9 +126,7 @@ class ProgressLine(LocalWriter):
             CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
             self._due = start + SECONDS_BETWEEN_LINES
             return
-        line = Table.grid(padding=(0, 1))
-        line.add_column(width=16)
-        line.add_column(no_wrap=True, overflow="ellipsis")
+        line = Table.grid(Column(width=16), Column(no_wrap=True, overflow="ellipsis"), padding=(0, 1))
         line.add_row(ProgressBar(total=1.0, completed=done), text)
         if self._live is None:  # without a thread that redraws ten times a second
             self._live = Live(console=CONSOLE, auto_refresh=False)

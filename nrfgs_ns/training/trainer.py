@@ -187,9 +187,8 @@ class NrfgsTrainer(Trainer):
         unit, means = self.pipeline.model.scene_unit, self.config.optimizers["means"]
         optimizer, scheduler = means["optimizer"], means["scheduler"]
         if scheduler is not None:
-            rates = {name: getattr(scheduler, name, None) for name in ("lr_final", "lr_pre_warmup")}
-            rates = {name: unit * rate for name, rate in rates.items() if rate is not None}
-            scheduler = replace(scheduler, **rates)
+            rates = {name: value for name, value in vars(scheduler).items() if name in ("lr_final", "lr_pre_warmup")}
+            scheduler = replace(scheduler, **{name: unit * rate for name, rate in rates.items() if rate is not None})
         means = {"optimizer": replace(optimizer, lr=unit * optimizer.lr), "scheduler": scheduler}
         return {**self.config.optimizers, "means": means}
 

@@ -172,31 +172,24 @@ def _absolute(path: Path | None) -> Path | None:
 def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool) -> None:
     """Say what was chosen automatically, and write the numbers behind it to `NOTES`."""
     model = pipeline.model
-    views, given = model.num_views, model.num_train_data
-    parts, notes = [], [*pipeline.notes]
-    if steps_are_chosen:
-        parts.append(f"{steps_for(views):,} steps")
-        notes.append(f"steps: {STEPS_PER_VIEW} a view, at least {FEWEST_STEPS:,} and at most {STEPS:,}")
-    if model.trust < FEW:
-        parts.append("view dependence reduced, as suits few views")
-    if model.trust < 1.0:
-        notes.append(f"trust in view dependence: {model.trust:.2g} of 1")
-    if suited := model.suited_head:
-        chosen = (f"{name} {round(value, 3) if isinstance(value, float) else value}" for name, value in suited.items())
-        notes.append(f"head, by views and densification: {', '.join(chosen)}")
-    if model.view_noise.sigma > 0.0:
-        offset = model.noise_factor * model.camera_spacing / model.scene_unit
-        notes.append(
-            f"noise on the camera centre in training: about {offset:.2g} scene units, {model.noise_factor:.2g} times "
-            "the distance between neighbouring cameras"
-        )
-    if model.config.near_plane == "auto" and model.near > 0.0:
-        notes.append(
-            f"near plane: {model.near / model.scene_unit:.2g} scene units, half the depth of the nearest points"
-        )
-    count = f"{given} training view{'s' * (given != 1)}"
-    if views != given:
-        count = f"{views} different training views of {given}"
+    views, given, suited, unit = model.num_views, model.num_train_data, model.suited_head, model.scene_unit
+    parts = [f"{steps_for(views):,} steps"] if steps_are_chosen else []
+    parts += ["view dependence reduced, as suits few views"] if model.trust < FEW else []
+    rounded = (f"{name} {round(value, 3) if isinstance(value, float) else value}" for name, value in suited.items())
+    offset, near = model.noise_factor * model.camera_spacing / unit, model.near / unit
+    chosen = {
+        f"steps: {STEPS_PER_VIEW} a view, at least {FEWEST_STEPS:,} and at most {STEPS:,}": steps_are_chosen,
+        f"trust in view dependence: {model.trust:.2g} of 1": model.trust < 1.0,
+        f"head, by views and densification: {', '.join(rounded)}": bool(suited),
+        f"noise on the camera centre in training: about {offset:.2g} scene units, {model.noise_factor:.2g} times the "
+        "distance between neighbouring cameras": model.view_noise.sigma > 0.0,
+        f"near plane: {near:.2g} scene units, half the depth of the nearest points": (
+            model.config.near_plane == "auto" and model.near > 0.0
+        ),
+    }
+    notes = [*pipeline.notes, *(note for note, holds in chosen.items() if holds)]
+    one = f"{given} training view{'s' * (given != 1)}"
+    count = one if views == given else f"{views} different training views of {given}"
     if parts:
         CONSOLE.print(f"{count}: {', '.join(parts)} (docs/captures.md).", soft_wrap=True)
     data = pipeline.datamanager.train_dataset

@@ -107,11 +107,6 @@ class ViewerPanel(ViewerControl):
             client.camera.position = first.position + STEP_FORWARD * self.viewer.config.camera_frustum_scale * forward
             client.camera.wxyz = first.wxyz
 
-    def _welcome_waiting(self) -> None:
-        waiting, self.waiting = self.waiting, []
-        for client in waiting:
-            self._welcome(client)
-
     @property
     def options(self) -> PictureOptions:
         """The picture that the controls name."""
@@ -125,7 +120,9 @@ class ViewerPanel(ViewerControl):
         with uninterrupted():
             if self.count.value != (count := f"{self.model.num_points:,}"):
                 self.count.value = count
-            self._welcome_waiting()
+            waiting, self.waiting = self.waiting, []
+            for client in waiting:
+                self._welcome(client)
         # As in nerfstudio, the viewer's background is used where the configuration leaves it open.
         background = self.background if self.model.config.background_color == "random" else None
         self.model.set_crop(obb_box)

@@ -82,8 +82,8 @@ def _tour_in(file: Path) -> dict[str, Any]:
         where, view = f"{file}: camera_path[{i}]", views[i] if isinstance(views[i], dict) else {}
         matrix = _numbers(view.get("camera_to_world"), 16, f"{where}.camera_to_world")
         fov, aspect = _numbers([view.get("fov"), view.get("aspect")], 2, f"{where}: fov and aspect")
-        kept.append({"matrix": [matrix[4 * row + column] for column in range(4) for row in range(4)]})
-        kept[-1] |= {"fov": fov, "aspect": aspect}
+        columns = [matrix[4 * row + column] for column in range(4) for row in range(4)]
+        kept.append({"matrix": columns, "fov": fov, "aspect": aspect})
     return {"views": kept, "seconds": seconds, "loop": loop}
 
 

@@ -42,9 +42,7 @@ def page(
         "about": json.dumps(about, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
         "packed": html.escape(scene) if beside else base64.b64encode(scene).decode(),
     }
-    text = _asset("page.html")
-    pieces = text.split("{{")
-    return pieces[0] + "".join(parts[name] + rest for name, rest in (piece.split("}}", 1) for piece in pieces[1:]))
+    return re.sub(r"{{(\w+)}}", lambda place: parts[place[1]], _asset("page.html"))
 
 
 def _asset(name: str) -> str:

@@ -8,8 +8,10 @@ import pytest
 import torch
 
 from nrfgs_lab.bench import run as bench_run
+from nrfgs_lab.bench.file import make_spec
+from nrfgs_lab.bench.job import Job, command, identity
 from nrfgs_lab.bench.measure import over_views
-from nrfgs_lab.bench.spec import Job, cells_of, command, identity, make_spec
+from nrfgs_lab.bench.spec import cells_of
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 

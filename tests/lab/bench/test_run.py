@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from nrfgs_lab.bench import run as bench_run
+from nrfgs_lab.bench.job import Job
 from nrfgs_lab.bench.run import forget_other_arguments, last_checkpoint, record_until, train_or_continue
-from nrfgs_lab.bench.spec import Job
 from nrfgs_lab.training_run import TrainRecord
 from nrfgs_ns.files import write_whole
 

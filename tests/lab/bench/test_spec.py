@@ -13,19 +13,9 @@ from PIL import Image
 from small_colmap import Model
 
 from nrfgs_lab.bench.data import held_out_views, parser_options
-from nrfgs_lab.bench.spec import (
-    PRESET_STEPS,
-    Scene,
-    Spec,
-    cells_of,
-    command,
-    differences,
-    identity,
-    load_spec,
-    make_spec,
-    settings,
-    steps_of,
-)
+from nrfgs_lab.bench.file import load_spec, make_spec
+from nrfgs_lab.bench.job import command, differences, identity, settings
+from nrfgs_lab.bench.spec import PRESET_STEPS, Scene, Spec, cells_of, steps_of
 from nrfgs_lab.pages.methods import HEADS, best_trial
 from nrfgs_lab.pages.options import methods
 from nrfgs_lab.training_run import parse
