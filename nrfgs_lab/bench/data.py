@@ -7,6 +7,7 @@
 - Held out: a data set of the training views alone, at half the size, some of which are test views, in the work folder:
   for choosing settings without looking at test views.
 - Fewer views: the capture with its own test views and some of its training views.
+- A smaller size that the capture has no images of: they are made, since other projects' methods only read them.
 """
 
 import json
@@ -41,9 +42,12 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
         with FileLock(mirror.with_name(f"{mirror.name}.lock")):
             if not (mirror / "transforms.json").exists():
                 select_views(folder, mirror, scene)
+                write_smaller(mirror, mirror, scene)
         return ["nrfgs-data", "--data", str(mirror), *scale, *scene.options]
     if (folder / "transforms.json").is_file():
         split = [] if names_its_split(folder / "transforms.json") else ["--eval-mode", "interval"]
+        with FileLock(mirror.with_name(f"{mirror.name}.lock")):
+            folder = write_smaller(folder, mirror, scene)
         return ["nrfgs-data", "--data", str(folder), *split, *scale, *scene.options]
     model = find_colmap(folder)
     if model is None:
@@ -117,6 +121,28 @@ def _halve(meta: dict, folder: Path, out: Path) -> None:
     meta |= {"w": size[0], "h": size[1]}
     if "ply_file_path" in meta:
         shutil.copy(folder / meta["ply_file_path"], out / meta["ply_file_path"])
+
+
+def write_smaller(folder: Path, mirror: Path, scene: Scene) -> Path:
+    """The folder of a data set with images at the scene's `downscale`: `folder` if it needs none, or has them, else
+    `mirror`, in which they are written as `nrfgs-data` would resize them, beside links to the rest."""
+    if scene.downscale is None or (folder / f"images_{scene.downscale}").is_dir():
+        return folder
+    meta = json.loads((folder / "transforms.json").read_text(encoding="utf-8"))
+    kinds = {"file_path": ("images", Image.Resampling.LANCZOS), "mask_path": ("masks", Image.Resampling.NEAREST)}
+    mirror.mkdir(parents=True, exist_ok=True)
+    for entry in folder.iterdir():
+        if not (mirror / entry.name).exists():
+            (mirror / entry.name).symlink_to(entry.resolve())
+    for frame in meta.get("frames", []):
+        for key in kinds.keys() & frame.keys():
+            name, sampling = kinds[key]
+            target = mirror / f"{name}_{scene.downscale}" / Path(frame[key]).name
+            if not target.exists():
+                with Image.open(folder / frame[key]) as picture, whole(target) as aside:
+                    size = [side // scene.downscale for side in picture.size]
+                    picture.resize(size, sampling).save(aside, "PNG")  # lossless, whatever the name says
+    return mirror
 
 
 def names_its_split(transforms: Path) -> bool:

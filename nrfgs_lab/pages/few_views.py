@@ -7,6 +7,7 @@ from statistics import fmean, median
 
 from scipy.stats import binomtest
 
+from nrfgs_lab.bench.spec import OWN
 from nrfgs_lab.pages.runs import VIEWS, Trainings, grid, mean, records, signed, trainings, view_gains
 
 FIELD, HOST, SAME = "nrfgs", "splatfacto", "harmonics, same rules"
@@ -22,14 +23,9 @@ def runs_of(scene: str, name: str) -> Trainings:
     return sorted(runs, key=lambda one: one["seed"])
 
 
-def today(scene: str, name: str) -> Trainings:
-    """The trainings of a capture with today's default settings in results/default.json, by seed."""
-    runs = {}
-    for sitting in ("one version", "test views", "logit"):  # the later one counts
-        for one in records("default").values():
-            if (one["scene"], one["name"]) == (scene, f"{sitting}: {name}"):
-                runs[one["seed"]] = one
-    return [runs[seed] for seed in sorted(runs)]
+def today(scene: str, name: str, strategy: str = OWN) -> Trainings:
+    """The trainings of a capture with today's settings, by seed."""
+    return trainings("test-views", scene, name.replace(",", "_").replace(" ", "_"), strategy)
 
 
 def _ahead(gains: list[float], digits: int = 1) -> str:
@@ -130,6 +126,21 @@ def _run(one: Mapping) -> str:
     return f"{one['psnr']:.2f} dB, {one['ssim']:.3f}, {one['splats'] / 1000:.0f}k splats{seconds}"
 
 
+def summary(*place: str) -> str:
+    """PSNR, SSIM and splats of today's trainings of a capture and run, means over seeds."""
+    runs = today(*place)
+    return f"{mean(runs, 'psnr'):.2f} dB, {mean(runs, 'ssim'):.3f}, {mean(runs, 'splats') / 1000:.0f}k splats"
+
+
+def sparse() -> str:
+    """The protocol of 24 views: PSNR, SSIM and thousands of splats of the field and of harmonics."""
+    body = []
+    for scene in ("24_views_bonsai", "kitchen"):
+        runs = (trainings("twenty-four", scene, name, OWN) for name in (FIELD, "harmonics__same_rules"))
+        body.append([scene.rpartition("_")[2], *(f"{cell(one)}, {mean(one, 'splats') / 1000:.0f}k" for one in runs)])
+    return grid(["", "`nrfgs`", "harmonics, same rules"], body)
+
+
 def moved() -> str:
     """On how many captures MCMC is better on test views with the residual on the logit, and where not."""
     names = "nrfgs, 150,000 splats, opacity added", "nrfgs, 150,000 splats"
@@ -158,6 +169,8 @@ BLOCKS = {
     "captures.over_former": over_former,
     "captures.rules_gain": rules_gain,
     "captures.floaters": floaters,
+    "captures.today": summary,
+    "captures.sparse": sparse,
     "captures.run": lambda name: _run(records("default")[name]),
     "deviations.moved": moved,
     "deviations.twice": twice,

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The vocabulary of the blocks: records, the trainings in them, what they gain over each other, and how it is written.
 
-A training is a dictionary with `seed`, `psnr`, `ssim`, `ms_ssim` (means over test views), `splats` and `per_image`: for
-each test view its name, PSNR, SSIM and MS-SSIM.
+A training is a dictionary with `seed`, `psnr`, `ssim`, `ms_ssim` and `flip` (means over test views), `train_psnr`,
+`splats` and `per_image`: for each test view its name, PSNR, SSIM and MS-SSIM.
 """
 
 import json
@@ -18,7 +18,7 @@ from nrfgs_lab.bench.table import BY_NAME, Row
 from nrfgs_lab.bench.table import grid as grid
 
 ROOT = Path(__file__).resolve().parents[2]
-RUN = re.compile(r"runs/(?P<run>.+)-(?P<strategy>own|original|mcmc@\d+)-(?P<scene>[^-]+)-(?P<seed>\d+)")
+RUN = re.compile(r"runs/(?P<run>.+)-(?P<strategy>own|original|(mcmc|error-guided)@\d+)-(?P<scene>[^-]+)-(?P<seed>\d+)")
 """Names of a benchmark's records. An underscore stands for a space."""
 VIEWS = {"bonsai": 255, "goldcape": 74, "caliterra": 65, "fox": 43, "castle": 26, "kitchen": 21, "fern": 17}
 """Capture -> its training views."""
@@ -60,9 +60,9 @@ def trainings(study: str, scene: str, run: str, strategy: str = ORIGINAL) -> Tra
     row = bench_rows(study).get((scene, strategy, run))
     metrics, trainings = ("psnr", "ssim", "ms_ssim"), []
     for seed, record in row.records.items() if row else ():
-        test = record["measured"]["test"]
+        test, train = record["measured"]["test"], record["measured"]["train"] or {}
         views = [[view["image"], *(view[metric] for metric in metrics)] for view in test["per_image"]]
-        values = {metric: test[metric] for metric in metrics}
+        values = {metric: test.get(metric) for metric in (*metrics, "flip")} | {"train_psnr": train.get("psnr")}
         trainings.append({**values, "seed": seed, "per_image": views, "splats": record["measured"]["splats"]})
     return trainings
 

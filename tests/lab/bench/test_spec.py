@@ -253,6 +253,17 @@ def test_held_out_scenes_have_no_test_view_and_the_same_cameras_at_half_the_size
         parser_options(source.parent, Scene("tiny", held_out=3), tmp_path / "mirrors")
 
 
+def test_smaller_images_are_there_for_methods_that_only_read_them(tiny_scene, tmp_path):
+    """Equal to those that `nrfgs-data` resizes itself."""
+    resized = load(["nrfgs-data", "--data", str(tiny_scene), "--downscale-factor", "2"]).train_dataset
+    data = load(parser_options(tiny_scene.parent, Scene(tiny_scene.name, downscale=2), tmp_path / "mirrors"))
+    read = data.train_dataset
+    assert {path.parent.name for path in read.image_filenames} == {"images_2"}
+    for index in range(len(read)):
+        assert (read.get_numpy_image(index) == resized.get_numpy_image(index)).all()
+    assert not (tiny_scene / "images_2").exists()
+
+
 def test_compared_heads_have_what_held_out_views_chose():
     trials, rows = ({run.name: run for run in plans()["methods", name].runs} for name in ("heads", "methods"))
     for head, run in HEADS.items():
