@@ -5,12 +5,12 @@ from collections import defaultdict
 from statistics import fmean, median
 
 from nrfgs_lab.pages.few_views import FEW, FIELD, SAME, SHRUNK, cell, runs_of, today, views_of
-from nrfgs_lab.pages.runs import VIEWS, grid, mean, records, signed
+from nrfgs_lab.pages.runs import VIEWS, Trainings, grid, mean, records, signed
 from nrfgs_lab.pages.speed import RENDERERS, scale_cells
 
 RIVALS = {
-    "`nrfgs` with splatfacto's densification": "nrfgs",
-    "harmonics, the same": SHRUNK,
+    "field, splatfacto's": "nrfgs",
+    "harmonics, splatfacto's": SHRUNK,
     "field, MCMC": "nrfgs, 150,000 splats",
     "harmonics, MCMC": "harmonics, 150,000 splats",
 }
@@ -20,37 +20,25 @@ GAPS = {
     "residual on the logit": "on the logit",
     "four times the residual, on the logit": "four times on the logit",
     "dead by the stored opacity": "dead by the stored opacity",
-    "on the logit, dead by the stored opacity": "on the logit, dead by the stored opacity",
     "harmonics, same rules": "harmonics",
-    "harmonics of degree 1": "harmonics, degree 1",
-    "field without opacity residual": "no opacity residual",
-    "field, rates a tenth (latents), a fifth (network)": "slow field",
-    "field, one band": "one band",
-    "field without distance": "no distance",
 }
 """Label -> trial with gaps in results/default.json; its default added the residual to the opacity."""
-HALF_SIZE = {
-    "**twice the residual, on the logit**": "twice on the logit",
-    "**and a threshold of 0.0018**: `nrfgs` on `bonsai`": "twice on the logit, threshold 0.0018",
-    "four times the residual, on the logit": "four times on the logit",
-    "residual on the logit": "on the logit",
-    "residual on the logit, threshold 0.0018": "on the logit, threshold 0.0018",
-    "dead by the stored opacity": "dead by the stored opacity",
-    "harmonics, same rules": "harmonics",
-}
-"""Label -> trial with every eighth training view held out, against the same default."""
+TODAY = (
+    "full resolution from the start",
+    "twice the colour residual",
+    "antialiased",
+    "a term against needles",
+    "opacities at 0.4 of their rate",
+)
+"""Trials in results/default.json against today's default."""
 RULES = {
     "**by error, points from photographs, near plane**": "by error, dense start, near plane",
     "without the near plane": "by error, dense start",
     "without points from photographs": "by error, near plane",
-    "near plane at 0.8 instead of 0.5": "default: near plane 0.8",
     "threshold 0.004 instead of 0.0025": "default: threshold 0.004",
-    "dead below 0.05 instead of 0.1": "default: dead below 0.05",
     "u = 1": "default: u = 1",
     "weight of SSIM 0.3 instead of 0.2": "default: SSIM 0.3",
     "3DGS's rules, points from photographs, near plane": "3DGS's rules, dense start, near plane",
-    "splatfacto's rules, near plane": "splatfacto's rules, near plane",
-    "splatfacto's rules, points from photographs": "splatfacto's rules, dense start",
 }
 """Label -> trial in results/default.json."""
 BASE = "splatfacto's rules"
@@ -58,31 +46,31 @@ BASE = "splatfacto's rules"
 
 
 def default() -> str:
-    """More of the same: each seed, other metrics, the worst view, splats."""
+    """The field and harmonics on test views: each seed, other metrics, the worst view, splats."""
     body = []
-    for scene, views in VIEWS.items():
-        for label, runs in (("field", today(scene, FIELD)), ("harmonics", today(scene, SAME))):
-            seeds = ", ".join(f"{one['psnr']:.2f}" for one in runs)
-            means = [
-                f"{mean(runs, metric):.3f}" if all(metric in one for one in runs) else "-"
-                for metric in ("ssim", "ms_ssim", "flip")
-            ]
-            middle = fmean(median(view[1] for view in one["per_image"]) for one in runs)
-            worst = min(view[1] for one in runs for view in one["per_image"])
-            gap = mean(runs, "train_psnr") - mean(runs, "psnr")
-            numbers = f"{middle:.1f}", f"{worst:.1f}", f"{gap:.1f}", f"{mean(runs, 'splats') / 1000:.0f}k"
-            body.append([f"{scene}, {views}", label, seeds, *means, *numbers])
-    head = "PSNR of each seed", "SSIM", "MS-SSIM", "FLIP", "median view", "worst view", "gap", "splats"
-    return grid(["capture", "", *head], body)
+    for scene in VIEWS:
+        both = today(scene, FIELD), today(scene, SAME)
+        seeds = [", ".join(f"{one['psnr']:.2f}" for one in runs) for runs in both]
+        body.append([scene, *seeds, *map("/".join, zip(*map(_metrics, both), strict=True))])
+    head = "SSIM", "MS-SSIM", "FLIP", "median view", "worst view", "gap", "splats"
+    return grid(["", "PSNR of the field", "of harmonics", *head], body)
+
+
+def _metrics(runs: Trainings) -> list[str]:
+    """Means over trainings, and the worst view of all."""
+    cells = [f"{mean(runs, metric):.3f}" for metric in ("ssim", "ms_ssim", "flip")]
+    middle = fmean(median(view[1] for view in one["per_image"]) for one in runs)
+    worst = min(view[1] for one in runs for view in one["per_image"])
+    gap = mean(runs, "train_psnr") - mean(runs, "psnr")
+    return [*cells, f"{middle:.1f}", f"{worst:.1f}", f"{gap:.1f}", f"{mean(runs, 'splats') / 1000:.0f}k"]
 
 
 def rivals() -> str:
     """Today's default beside splatfacto's densification and 150,000 splats by 3DGS-MCMC, on test views."""
     body = [
-        [f"{scene}, {views}", cell(today(scene, FIELD)), *(cell(runs_of(scene, name)) for name in RIVALS.values())]
-        for scene, views in VIEWS.items()
+        [scene, cell(today(scene, FIELD)), *(cell(runs_of(scene, name)) for name in RIVALS.values())] for scene in VIEWS
     ]
-    return grid(["capture, training views", "`nrfgs`", *RIVALS], body)
+    return grid(["", "`nrfgs`", *RIVALS], body)
 
 
 def rules() -> str:
@@ -108,9 +96,9 @@ def _splats(trial: str) -> dict[str, float]:
     return {scene: fmean(counts) for scene, counts in splats.items()}
 
 
-def _changes(sitting: str, trial: str) -> dict[str, tuple[float, float, float, int]]:
-    """Changes by a trial of a sitting, against its default with the same seeds, by capture: PSNR and SSIM, the share of
-    the default's splats, and the number of pairs."""
+def _changes(sitting: str, trial: str) -> dict[str, tuple[float, float, float]]:
+    """Changes by a trial of a sitting, against its default with the same seeds, by capture: PSNR, SSIM, and the share
+    of the default's splats."""
     runs = {(one["name"], one["scene"], one.get("seed")): one for one in records("default").values()}
     pairs = defaultdict(list)
     for (name, scene, seed), one in runs.items():
@@ -118,20 +106,18 @@ def _changes(sitting: str, trial: str) -> dict[str, tuple[float, float, float, i
         if name == f"{sitting}: {trial}" and base:
             change = *(one[metric] - base[metric] for metric in ("psnr", "ssim")), one["splats"] / base["splats"]
             pairs[scene.rpartition("/")[2]].append(change)
-    return {scene: (*map(fmean, zip(*them, strict=True)), len(them)) for scene, them in pairs.items()}
+    return {scene: tuple(map(fmean, zip(*them, strict=True))) for scene, them in pairs.items()}
 
 
 def changes(trials: dict[str, str], sitting: str) -> str:
-    """Changes by trials on each capture: dB/SSIM x 1000, share of splats, and pairs of trainings."""
-    rows = {label: _changes(sitting, trial) for label, trial in trials.items()}
-    captures = [scene for scene in VIEWS if any(scene in row for row in rows.values())]
+    """Changes by trials on each capture, dB/SSIM x 1000, and the median share of splats over captures."""
     body = []
-    for label, row in rows.items():
-        cells = []
-        for dB, ssim, share, number in (row.get(scene, (None,) * 4) for scene in captures):
-            cells.append(f"{signed(dB, 2)}/{signed(1000 * ssim, 0)}, x{share:.1f} ({number})" if number else "-")
-        body.append([label, *cells])
-    return grid(["", *captures], body)
+    for label, trial in trials.items():
+        row = _changes(sitting, trial)
+        changed = (row.get(scene) for scene in VIEWS)
+        cells = [f"{signed(one[0], 2)}/{signed(1000 * one[1], 0)}" if one else "" for one in changed]
+        body.append([label, *cells, f"{median(one[2] for one in row.values()):.1f}"])
+    return grid(["", *VIEWS, "splats"], body)
 
 
 def logit() -> str:
@@ -145,11 +131,18 @@ def logit() -> str:
     return ", and ".join(texts)
 
 
-def scale(column: str, factor: str, form: str) -> str:
-    """A quantity of training steps after growth, medians of repeats."""
-    body = []
-    for (count, pixels), cells in scale_cells(column).items():
-        values = (format(median(cells[one]) * float(factor), form) for one in RENDERERS)
+def scale() -> str:
+    """Steps after growth: milliseconds, those of the GPU's work, and gigabytes at the peak, medians of repeats."""
+    columns = {"step_ms": (1, ".2f"), "gpu_ms": (1, ".2f"), "peak_mb": (0.001, ".1f")}
+    cells, body = {column: scale_cells(column) for column in columns}, []
+    for count, pixels in cells["step_ms"]:
+        values = (
+            "/".join(
+                format(median(cells[column][count, pixels][renderer]) * factor, form)
+                for column, (factor, form) in columns.items()
+            )
+            for renderer in RENDERERS
+        )
         body.append([f"{count / 1e6:g}M, {pixels:g} MP", *values])
     return grid(["splats, image", *RENDERERS.values()], body)
 
@@ -160,6 +153,6 @@ BLOCKS = {
     "tables.rules": rules,
     "captures.logit": logit,
     "tables.gaps": lambda: changes(GAPS, "gaps"),
-    "tables.half_size": lambda: changes(HALF_SIZE, "half size"),
+    "tables.today": lambda: changes(dict(zip(TODAY, TODAY, strict=True)), "today"),
     "tables.scale": scale,
 }

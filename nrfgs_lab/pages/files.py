@@ -20,12 +20,6 @@ def reports(scene: str) -> dict[str, Report]:
     return dict(sorted(((n, one) for n, one in every.items() if "bytes" in one), key=lambda pair: -pair[1]["bytes"]))
 
 
-def added(scene: str) -> str:
-    """Per cent of a training's seconds that the longest of its fine-tunes takes."""
-    longest = max(one["seconds"]["finetune"] for one in reports(scene).values() if one.get("finetune"))
-    return f"{100 * longest / records('compact')[f'{scene}-model']['train']['seconds']:.0f} %"
-
-
 def draw() -> None:
     """The figure: a line of fine-tunes for each scene, and the file without one."""
     import matplotlib
@@ -76,7 +70,6 @@ def losses() -> str:
 
 
 BLOCKS = {
-    "compact_format.added": added,
     "export.losses": losses,
     "export.worst": lambda: f"{max(one['loss_db'] for one in plies().values()):.1f}",
 }

@@ -152,12 +152,12 @@ SAME = {"3DGS": "SH", "VDGS": "VDGS", "GSNB": "GSNB", "NRF": "NRF"}
 
 def worth(change: str) -> str:
     """Effect of a single change on held-out views, capture by capture: dB in the median view, times the splats."""
-    cells = []
+    gains, shares = [], []
     for scene in SCENES:
         changed, plain = (trainings("deviations", scene, run) for run in (change, change.partition("_")[0]))
-        gain = signed(median(view_gains(changed, plain)), 2)
-        cells.append(f"{gain} (x{mean(changed, 'splats') / mean(plain, 'splats'):.2f})")
-    return ", ".join(cells)
+        gains.append(signed(median(view_gains(changed, plain)), 2))
+        shares.append(f"{mean(changed, 'splats') / mean(plain, 'splats'):.2f}")
+    return f"{'/'.join(gains)}, x{'/'.join(shares)}"
 
 
 def noise() -> str:

@@ -27,10 +27,10 @@ APPEARANCE = "pipeline.model.appearance."
 
 INTRODUCTION = """# Options
 
-**What this package adds to nerfstudio's options, or sets in its own way; `ns-train nrfgs --help` lists all.** Defaults
-are `nrfgs`'s. `nrfgs-sh`, `nrfgs-vdgs`, `nrfgs-gsnb` and `nrfgs-sg` have `view-noise`, `few-views`, `shrinkage`,
-`dense-start` and `near-plane` off, splatfacto's densification, and 30,000 steps without averaging; each can be switched
-on. Cameras lie within [-1, 1] scene units. `python -m nrfgs_lab.pages.options` writes this page.
+**These options, with `nrfgs`'s defaults, are this package's own; `ns-train nrfgs --help` lists all.** `nrfgs-sh`,
+`nrfgs-vdgs`, `nrfgs-gsnb` and `nrfgs-sg` have `view-noise`, `few-views`, `shrinkage`, `dense-start` and `near-plane`
+off, splatfacto's densification, and 30,000 steps without averaging. Cameras lie within [-1, 1] scene units.
+`python -m nrfgs_lab.pages.options` writes this page.
 """
 SPLATFACTOS = {field.name for field in dataclasses.fields(SplatfactoModelConfig)}
 """Options of splatfacto's model, not explained here."""
@@ -38,13 +38,16 @@ LEFT_OUT = (
     *("logging.local-writer.enable", "pipeline.datamanager.cache-images-type", "pipeline.sharding.rebalance-at"),
     *(APPEARANCE + name for name in ("distance-eps", "implementation", "precision")),
     *("load-3D-points", "viewer.websocket-host", "pipeline.datamanager.image-memory", "pipeline.compact"),
+    MODEL + "warmup-steps",
 )
 """Options that few need, or that another page explains: `--help` has them."""
-HOST = "`--data`, `--vis`, `--load-dir`, `--output-dir` and `--machine.seed` are nerfstudio's.\n"
+HOST = """`--data`, `--vis`, `--load-dir`, `--output-dir` and `--machine.seed` are nerfstudio's. `--help` lists learning
+rates, `--optimizers.NAME.optimizer.lr` to `.scheduler.lr-final`.
+"""
 
 
 class Option(NamedTuple):
-    """A row of the page."""
+    """An item of the page."""
 
     flag: str
     """with dots and hyphens, without leading hyphens"""
@@ -84,12 +87,11 @@ def _explanations(config: type) -> dict[str, str]:
     return {field.arg_name: " ".join((field.description or "").split()) for field in found}
 
 
-def table(options: list[Option], prefix: str = "") -> str:
-    """A Markdown table, the flags without their common prefix."""
-    lines = [f"| `--{prefix}` | default | |" if prefix else "| | default | |", "|---|---|---|"]
+def listed(options: list[Option], prefix: str = "") -> str:
+    """A Markdown list: flags without their common prefix, with their defaults, and what they are."""
+    lines = [f"Below `--{prefix}`:\n"] if prefix else []
     for option in options:
-        text = linked(option.text.replace("|", "\\|"))
-        lines.append(f"| `{option.flag.removeprefix(prefix)}` | {_shown(option.default)} | {text} |")
+        lines.append(f"- **`{option.flag.removeprefix(prefix)} {_shown(option.default)}`** {linked(option.text)}")
     return "\n".join(lines) + "\n"
 
 
@@ -101,7 +103,7 @@ def linked(text: str) -> str:
 def _shown(default: Any) -> str:
     if default is dataclasses.MISSING:
         return "required"
-    if default is None or default == "" or default == ():
+    if default == "" or default == ():
         return "none"
     if isinstance(default, (tuple, list)):
         return " ".join(map(str, default))
@@ -125,51 +127,37 @@ def page() -> str:
     parts = [
         INTRODUCTION,
         "## The field\n",
-        table(heads, APPEARANCE),
+        listed(heads, APPEARANCE),
         "## The model, with every head\n",
-        table(model, MODEL),
+        listed(model, MODEL),
         strategies(),
         "## Training and data\n\n`nrfgs-data` and what follows it come last in a command.\n",
-        table([option for option in rest if ".dataparser." not in option.flag] + data),
+        listed([option for option in rest if ".dataparser." not in option.flag] + data),
         HOST,
-        rates(first),
         "## Methods\n",
-        "| `ns-train` | |\n|---|---|",
-        *(f"| `{one.config.method_name}` | {linked(one.description)} |" for one in others),
+        *(f"- `{one.config.method_name}`: {linked(one.description)}" for one in others),
         "\n`ns-train METHOD --help` explains the options of its head, `nrfgs --help` lists the other commands.",
     ]
     return "\n".join(parts) + "\n"
 
 
 def strategies() -> str:
-    """Options of the densification strategies; a row for all that explain one alike."""
+    """Options of the densification strategies; one item for all that explain an option alike."""
     rows: dict[tuple[str, str], dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
     for name, config in STRATEGIES.items():
         for option in own_options(config()):
             rows[option.flag.replace("-", "_"), option.text][_shown(option.default)].append(f"`{name}`")
-    lines = ["| | default of | |", "|---|---|---|"]
+    lines = []
     for (flag, text), defaults in rows.items():
         cells = [
             f"{', '.join(names)}: {default}" for default, names in defaults.items() if len(names) < len(STRATEGIES)
         ]
         cell = "; ".join(cells) or f"all: {next(iter(defaults))}"
-        lines.append(f"| `{flag}` | {cell} | {linked(text)} |")
+        lines.append(f"- `{flag}` ({cell}): {linked(text)}")
     return (
-        "### Strategies\n\nOptions of a strategy follow its name: `--pipeline.model.densification "
-        "mcmc,budget=150000,refine_every=50`. [What they do](bench.md#densification-strategies).\n\n"
-        + "\n".join(lines)
-        + "\n"
+        "### Strategies\n\nOptions of a [strategy](bench.md#densification-strategies) follow its name: "
+        "`--pipeline.model.densification mcmc,budget=150000,refine_every=50`.\n\n" + "\n".join(lines) + "\n"
     )
-
-
-def rates(method: MethodSpecification) -> str:
-    """A sentence with a method's learning rates."""
-    parts = []
-    for name, group in method.config.optimizers.items():
-        scheduler = group["scheduler"]
-        final = "" if scheduler is None else f" to {scheduler.lr_final:g}"
-        parts.append(f"`{name}` {group['optimizer'].lr:g}{final}")
-    return f"Learning rates, `--optimizers.NAME.optimizer.lr` to `.scheduler.lr-final`: {', '.join(parts)}.\n"
 
 
 if __name__ == "__main__":

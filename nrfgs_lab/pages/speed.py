@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from nrfgs_lab.bench.table import Row
-from nrfgs_lab.pages.runs import VIEWS, bench_rows, grid, mean_of, records, signed, span
+from nrfgs_lab.pages.runs import VIEWS, bench_rows, grid, mean_of, records, span
 
 SITTING = timedelta(minutes=10)
 """Trainings that began within it were made on one machine, one after the other."""
@@ -30,12 +30,6 @@ def ratio(column: str, run: str, base: str) -> str:
         if abs(began(one) - began(two)) < SITTING
     ]
     return f"{median(ratios):.2f}"
-
-
-def spread(*runs: str) -> str:
-    """By how much the slowest training of a run is above its fastest, at most."""
-    every = [bench_rows("speed")["bonsai", "own", run].values["time s"].values() for run in runs]
-    return f"{100 * max(max(times) / min(times) - 1 for times in every):.0f} %"
 
 
 # The choice between methods and presets.
@@ -75,18 +69,6 @@ def presets() -> str:
     return grid(["PSNR/SSIM, splats, time", *(f"{scene}, {VIEWS[scene]} views" for scene in CAPTURES)], body)
 
 
-def gain(run: str, base: str) -> str:
-    """The least and the largest difference in dB over captures."""
-    pairs = [[_preset(scene, name)[0] for name in (run, base)] for scene in CAPTURES]
-    return span([mean_of(one, "PSNR") - mean_of(other, "PSNR") for one, other in pairs if one and other], signed)
-
-
-def time(scene: str, run: str, base: str) -> str:
-    """A run's share of another's time on a capture."""
-    ours, theirs = (median(_preset(scene, name)[0].values["time s"].values()) for name in (run, base))
-    return f"{ours / theirs:.2f}"
-
-
 # Steps and frames against splats and pixels (`timing/scale.py`).
 
 RENDERERS = {"nrfgs": "`nrfgs`", "nrfgs-sh": "`nrfgs-sh`", "splatfacto": "splatfacto"}
@@ -102,19 +84,20 @@ def scale_cells(column: str) -> dict[tuple[int, float], dict[str, list[float]]]:
     return dict(sorted(places.items()))
 
 
-def scale_frames() -> str:
-    """Frames per second at two sizes, medians of repeats."""
-    large, body = scale_cells("4K"), []
-    for place, small in scale_cells("1080p").items():
-        rates = (f"{median(small[one]):.0f}/{median(large[place][one]):.0f}" for one in RENDERERS)
-        body.append([f"{place[0] / 1e6:g}M", *rates])
-    return grid(["splats", *RENDERERS.values()], body)
+def scale_frames(splats: str) -> str:
+    """Frames per second at 1080p, medians of repeats."""
+    (cells,) = (one for (count, _), one in scale_cells("1080p").items() if count == float(splats))
+    return ", ".join(f"{name} {median(cells[one]):.0f}" for one, name in RENDERERS.items()).replace(", bare", " (bare)")
 
 
-def scale_ratio(column: str, other: str) -> str:
-    """Least and most that `nrfgs` has of another renderer's quantity over the table's cells."""
-    ratios = [median(cells["nrfgs"]) / median(cells[other]) for cells in scale_cells(column).values()]
-    return span(ratios, "{:.2f}".format)
+def scale_ratios() -> str:
+    """Least and most that a step of `nrfgs` has of another renderer's time over the table's cells."""
+    cells, parts = scale_cells("step_ms").values(), []
+    words = {"splatfacto": "splatfacto's time,", "nrfgs-sh": "`nrfgs-sh`'s and", "faster-gs": "Faster-GS's"}
+    for other, named in words.items():
+        ratios = [median(one["nrfgs"]) / median(one[other]) for one in cells]
+        parts.append(f"{span(ratios, '{:.2f}'.format)} of {named}")
+    return " ".join(parts)
 
 
 def scale_fit(column: str, factor: str, unit: str, renderer: str) -> str:
@@ -124,16 +107,7 @@ def scale_fit(column: str, factor: str, unit: str, renderer: str) -> str:
     return f"{parts[0]:.1f} {unit}, {parts[1]:.1f} for each million splats and {parts[2]:.2f} for each megapixel"
 
 
-def scale_spread() -> str:
-    """By how much a cell's slowest repeat is above its fastest, the median over cells with repeats."""
-    repeats = [values for cells in scale_cells("step_ms").values() for values in cells.values() if len(values) > 1]
-    return f"{100 * median(max(values) / min(values) - 1 for values in repeats):.0f} %"
-
-
 BLOCKS = {
-    **{
-        f"speed.{block.__name__}": block
-        for block in (ratio, scale_fit, scale_frames, scale_ratio, scale_spread, spread)
-    },
-    **{f"trade_off.{one.__name__}": one for one in (presets, gain, time)},
+    **{f"speed.{block.__name__}": block for block in (ratio, scale_fit, scale_frames, scale_ratios)},
+    "trade_off.presets": presets,
 }

@@ -48,28 +48,28 @@ class NrfConfig(AppearanceHeadConfig):
 
     _target: type = field(default_factory=lambda: NeuralResidualField)
     latent_dim: int = 32
-    """D: numbers in a splat's latent"""
+    """numbers in a splat's latent (D)"""
     num_bands: int = 3
-    """K: Fourier bands of the view direction; band 0 is low, the others are high"""
+    """Fourier bands of the view direction (K); band 0 is low, the others are high"""
     hidden_width: int = 64
     """hidden units of each branch; a single branch has twice as many"""
     split_bands: bool = True
-    """one branch for low and one for high bands, joined by a gate. Off: a single branch"""
+    """one branch for low and one for high bands, joined by a gate; otherwise a single branch"""
     opacity_residual: bool = True
     """the field changes opacity with the view"""
     use_distance: bool = True
     """the field sees the log distance to the camera"""
     color_scale: float = 0.2
-    """s_c: largest change of a colour channel, in units of white"""
+    """largest change of a colour channel (s_c), in units of white"""
     opacity_scale: float = 0.2
-    """s_alpha: largest change of opacity; with error-guided and mcmc twice this, unless `opacity_bound` is given"""
+    """largest change of opacity (s_alpha); twice this with error-guided and mcmc, unless `opacity_bound` is given"""
     distance_eps: float = NEAREST
     """smallest camera distance, in scene units; shorter ones count as this. The near plane"""
     output_init: Literal["zero", "default"] = "zero"
     """start of the output layers. zero: no residual. default: torch's, as in the paper, followed by the warm-up"""
     opacity_bound: OpacityBound | None = None
-    """how base + residual stays in [0, 1] (docs/deviations.md). straight-through: clamped, but the gradient ignores the
-    clamp. logit: added to the logit. None: logit for error-guided and mcmc, otherwise straight-through"""
+    """how base + residual stays in [0, 1] (docs/deviations.md). straight-through: by a clamp that the gradient ignores.
+    logit: added to the logit. None: logit with error-guided and mcmc, otherwise straight-through"""
     implementation: Literal["auto", "torch", "fused"] = "auto"
     """auto: fused Triton kernels on CUDA where they can run, PyTorch elsewhere. fused: an error instead of PyTorch"""
     precision: Literal["fp32", "tf32", "bf16", "fp16"] = "bf16"

@@ -69,7 +69,7 @@ class NrfgsDataParserConfig(NerfstudioDataParserConfig):
     _target: type = field(default_factory=lambda: NrfgsDataParser)
     eval_mode: Literal["interior", "interval", "fraction", "filename", "all"] = "interior"
     """test images where the data set names none. interior: every eval_interval-th by name, from the middle of the first
-    interval on. interval: from the first on. fraction: all except train_split_fraction. filename: by train or eval
+    interval. interval: from the first. fraction: all except train_split_fraction. filename: by train or eval
     in the name. all: every image is both"""
     load_3D_points: bool = True
     """start from the points of the data set (ply_file_path, otherwise colmap/sparse/0)"""

@@ -69,23 +69,23 @@ class ErrorGuided(DensificationConfig):
     counts: ClassVar[tuple[str, ...]] = ("budget", "most_splats")
     copies_splats: ClassVar[bool] = True
     opacity_seen: OpacitySeen = "peak"
-    """opacity by which splats are dead (docs/deviations.md). base: stored. peak: largest shown in two windows"""
+    """opacity by which splats are pruned, moved or replaced (docs/deviations.md). base: stored. peak: largest shown
+    lately"""
     refine_every: int = 200
-    """steps between refinements; the views of these are a window"""
+    """steps between refinements"""
     threshold: float = 0.0025
-    """error above which a splat may be split: the smaller, the more splats and detail. V different training views raise
-    it by the factor 1 + (V / 300)^2"""
+    """error above which a splat may be split: the smaller, the more splats and detail. V training views multiply it by
+    1 + (V / 300)^2"""
     budget: int = 0
-    """number of splats to grow to, whatever their error (arXiv 2605.16158). 0: the threshold decides"""
+    """number of splats to grow to (arXiv 2605.16158). 0: the threshold decides"""
     most_splats: int = 2_000_000
-    """upper bound; growth usually ends below it by itself"""
+    """upper bound; growth usually ends below it"""
     shrinkage: float = 0.2
-    """weight in the loss of the splats' mean opacity and mean size, in percent, beside the model's `shrinkage`: without
-    it there are large faint splats, which no reset removes, and twice the pairs of splats and tiles"""
+    """constant weight that is added to the model's, in percent, because no reset removes large faint splats"""
     grow_until: int = 15_000
     """step after which splats are only replaced"""
     stop_at: int = 25_000
-    """step after which nothing changes any more"""
+    """step after which splats are neither added nor moved nor replaced"""
 
     def check(self) -> None:
         super().check()

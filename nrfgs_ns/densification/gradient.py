@@ -40,7 +40,7 @@ class GradientConfig(DensificationConfig):
     reset_alpha_every: int = 30
     """refinements between two resets of opacities"""
     budget: int = 0
-    """number of splats to grow to: the gradient's threshold follows (arXiv 2605.16158). 0: the threshold decides"""
+    """number of splats to grow to (arXiv 2605.16158). 0: the threshold decides"""
 
     def check(self) -> None:
         super().check()
@@ -64,11 +64,11 @@ class Splatfacto(GradientConfig):
 
     name: ClassVar[str] = "splatfacto"
     densify_grad_thresh: float = 0.0008
-    """splats whose mean gradient of the loss by the screen position (normalised to [-1, 1]) is larger grow"""
+    """mean gradient of the loss by the screen position (in [-1, 1]) above which splats grow"""
     use_absgrad: bool = True
     """sum the gradients' absolute values over pixels (AbsGS)"""
     cull_alpha_thresh: float = 0.1
-    """splats of lower opacity are pruned; a reset brings opacities down to twice this"""
+    """opacity below which splats are pruned; a reset lowers opacities to twice this"""
     stop_screen_size_at: int = 4000
     """step after which sizes in the image do not count"""
 

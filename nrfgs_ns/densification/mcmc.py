@@ -38,12 +38,12 @@ class Mcmc(DensificationConfig):
     regularises: ClassVar[bool] = True
     counts: ClassVar[tuple[str, ...]] = ("budget",)
     opacity_seen: OpacitySeen = "peak"
-    """opacity by which splats are pruned or moved (docs/deviations.md). base: stored. peak: largest shown since the
-    last refinement"""
+    """opacity by which splats are pruned, moved or replaced (docs/deviations.md). base: stored. peak: largest shown
+    lately"""
     budget: int = 1_000_000
     """number of splats to grow to and to keep"""
     stop_at: int = 25_000
-    """step after which splats neither move to others nor are added"""
+    """step after which splats are neither added nor moved nor replaced"""
     opacity_regularisation: float = 0.01
     """weight of the mean opacity in the loss"""
 

@@ -87,8 +87,8 @@ class DensificationConfig(ABC):
     counts: ClassVar[tuple[str, ...]] = ()
     """options that are numbers of splats"""
     opacity_seen: OpacitySeen = "base"
-    """opacity by which splats are pruned or moved (docs/deviations.md). base: stored. peak: largest shown since the
-    last refinement"""
+    """opacity by which splats are pruned, moved or replaced (docs/deviations.md). base: stored. peak: largest shown
+    lately"""
     warmup_length: int = 500
     """step after which refinement begins"""
     refine_every: int = 100

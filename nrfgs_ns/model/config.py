@@ -34,32 +34,27 @@ class NrfgsModelConfig(ModelConfig):
     appearance: AppearanceHeadConfig = field(default_factory=NrfConfig)
     """the appearance head: what a splat's colour and opacity are, seen from a camera"""
     view_noise: float = 0.0
-    """noise on the camera centre from which the head sees each splat in training, in distances between neighbouring
-    training cameras (docs/captures.md)"""
+    """noise on the camera centre that the head sees in training, in distances between neighbouring training cameras
+    (docs/captures.md)"""
     few_views: Literal["auto", "off"] = "off"
-    """auto: V different training views give the head the trust u = V / (V + 20), which divides the noise and multiplies
-    the opacity residual (docs/captures.md)"""
+    """auto: the fewer the training views, the more noise and the less opacity residual (docs/captures.md)"""
     shrinkage: float = 0.0
     """weight in the loss of the splats' mean opacity and mean size, in percent, halved for every 12 training views
-    (docs/captures.md). error-guided adds a constant, mcmc has its own instead"""
+    (docs/captures.md)"""
     dense_start: Literal["auto", "off"] = "off"
-    """start with points from the photographs, too. auto: the more, the fewer views there are (docs/captures.md)"""
+    """auto: start with points from the photographs, too, the more the fewer there are (docs/captures.md)"""
     near_plane: Literal["auto", "off"] = "off"
-    """auto: splats are drawn from half the depth on at which training cameras see the capture's nearest points
-    (docs/captures.md). off: from splatfacto's 0.01 scene units on"""
+    """auto: draw nothing nearer than half the depth of the capture's nearest points (docs/captures.md). off: nothing
+    nearer than 0.01 scene units, as in splatfacto"""
     warmup_steps: int | None = None
-    """steps before training in which a head that starts with a residual unlearns it. None: one for each training
-    view"""
+    """steps before training in which a head that starts with a residual unlearns it. None: one for each view"""
     densification: DensificationChoice = field(default_factory=Splatfacto)
-    """how splats are added and removed: a strategy, and options of its own, as in mcmc,budget=150000; those left out
-    have the strategy's defaults, not a preset's (docs/options.md). error-guided: growth where the error is. splatfacto:
-    nerfstudio's rules. original: those of 3DGS. mcmc: 3DGS-MCMC, up to a budget"""
+    """how splats are added and removed: error-guided (where the error is), splatfacto, original (3DGS) or mcmc, with
+    options of its own, as in mcmc,budget=150000. Those left out have its defaults, not a preset's (docs/options.md)"""
     photographs: Literal["auto", "on", "off"] = "auto"
-    """learn each photograph's exposure and white balance. auto: if photographs or EXIF show that they vary
-    (docs/exposure.md)"""
+    """learn each photograph's exposure and white balance. auto: if they vary (docs/exposure.md)"""
     robust_loss: float = 0.0
-    """largest share of pixels that the loss ignores, those with the largest residuals, such as passers-by
-    (docs/exposure.md)"""
+    """largest share of pixels that the loss ignores: those with the largest residuals (docs/exposure.md)"""
     resolution_schedule: int = 3000
     """steps after which the resolution doubles"""
     num_downscales: int = 2

@@ -42,16 +42,15 @@ class NrfgsTrainerConfig(TrainerConfig):
 
     _target: type = field(default_factory=lambda: resolve_name(TRAINER))
     max_num_iterations: int = STEPS
-    """training steps. 0: 120 for each training view, from 10,000 to 30,000, with schedules stretched to them
-    (docs/captures.md)"""
+    """training steps. 0: 120 for each training view, from 10,000 to 30,000 (docs/captures.md)"""
     time_budget: float | None = None
     """minutes for all steps; schedules are stretched to the steps that fit"""
     schedule_steps: int | None = None
-    """steps for which schedules are given; they are stretched to the actual steps. None: not stretched; with a time
-    budget: max_num_iterations"""
+    """steps for which schedules are given; they are stretched to the actual steps. None: max_num_iterations with a time
+    budget, otherwise not stretched"""
     average_steps: int | None = None
-    """last steps over which the model's parameters are averaged, at most a fiftieth of all. 0: none. None: 200 if
-    max_num_iterations is 0, otherwise 0"""
+    """last steps over which parameters are averaged, at most a fiftieth of all. None: 200 if max_num_iterations is 0,
+    otherwise 0"""
 
     def setup(self, **kwargs) -> Trainer:
         """The trainer, for several devices the one that spreads the splats over them; InputError as `check`."""
