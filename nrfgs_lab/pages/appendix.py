@@ -22,7 +22,7 @@ GAPS = {
     "dead by the stored opacity": "dead by the stored opacity",
     "harmonics, same rules": "harmonics",
 }
-"""Label -> trial with gaps in results/default.json; its default added the residual to the opacity."""
+"""Label -> trial with gaps in results/trials.json; its default added the residual to the opacity."""
 TODAY = (
     "full resolution from the start",
     "twice the colour residual",
@@ -30,7 +30,7 @@ TODAY = (
     "a term against needles",
     "opacities at 0.4 of their rate",
 )
-"""Trials in results/default.json against today's default."""
+"""Trials in results/trials.json against today's default."""
 RULES = {
     "**by error, points from photographs, near plane**": "by error, dense start, near plane",
     "without the near plane": "by error, dense start",
@@ -40,7 +40,7 @@ RULES = {
     "weight of SSIM 0.3 instead of 0.2": "default: SSIM 0.3",
     "3DGS's rules, points from photographs, near plane": "3DGS's rules, dense start, near plane",
 }
-"""Label -> trial in results/default.json."""
+"""Label -> trial in results/trials.json."""
 BASE = "splatfacto's rules"
 """The trial that `RULES` are compared with."""
 
@@ -75,9 +75,9 @@ def rivals() -> str:
 
 def rules() -> str:
     """Gains of trials over splatfacto's rules on the held-out views that both have, and their share of its splats."""
-    body, theirs, base = [], views_of("default", BASE), _splats(BASE)
+    body, theirs, base = [], views_of("trials", BASE), _splats(BASE)
     for label, trial in RULES.items():
-        ours, cells, splats = views_of("default", trial), [], _splats(trial)
+        ours, cells, splats = views_of("trials", trial), [], _splats(trial)
         for scene in FEW:
             pairs = [(ours[view], theirs[view]) for view in theirs if view in ours and view[0] == scene]
             psnr, ssim = ([one[number] - other[number] for one, other in pairs] for number in (0, 1))
@@ -90,7 +90,7 @@ def rules() -> str:
 def _splats(trial: str) -> dict[str, float]:
     """Mean number of splats of a trial's trainings, by scene."""
     splats = defaultdict(list)
-    for one in records("default").values():
+    for one in records("trials").values():
         if one["name"] == trial:
             splats[one["scene"]].append(one["splats"])
     return {scene: fmean(counts) for scene, counts in splats.items()}
@@ -99,7 +99,7 @@ def _splats(trial: str) -> dict[str, float]:
 def _changes(sitting: str, trial: str) -> dict[str, tuple[float, float, float]]:
     """Changes by a trial of a sitting, against its default with the same seeds, by capture: PSNR, SSIM, and the share
     of the default's splats."""
-    runs = {(one["name"], one["scene"], one.get("seed")): one for one in records("default").values()}
+    runs = {(one["name"], one["scene"], one.get("seed")): one for one in records("trials").values()}
     pairs = defaultdict(list)
     for (name, scene, seed), one in runs.items():
         base = runs.get((f"{sitting}: default", scene, seed))

@@ -28,7 +28,7 @@ def runs_of(scene: str, name: str) -> Trainings:
 
 def today(scene: str, name: str, strategy: str = OWN) -> Trainings:
     """The trainings of a capture with today's settings, by seed."""
-    return trainings("test-views", scene, name.replace(",", "_").replace(" ", "_"), strategy)
+    return trainings("default", scene, name.replace(",", "_").replace(" ", "_"), strategy)
 
 
 def _ahead(gains: list[float], digits: int = 1) -> str:
@@ -108,7 +108,7 @@ def views_of(study: str, trial: str) -> Views:
 
 def rules_gain() -> str:
     """Least and most that today's rules gain over splatfacto's on the held-out views of a capture of few views."""
-    ours, theirs = (views_of("default", trial) for trial in ("by error, dense start, near plane", "splatfacto's rules"))
+    ours, theirs = (views_of("trials", trial) for trial in ("by error, dense start, near plane", "splatfacto's rules"))
     pairs = [[(ours[view], theirs[view]) for view in theirs if view in ours and view[0] == scene] for scene in FEW]
     psnr = [median(one[0] - other[0] for one, other in views) for views in pairs]
     ssim = [fmean(one[1] - other[1] for one, other in views) for views in pairs]
@@ -134,7 +134,7 @@ def summary(*place: str) -> str:
 
 
 def sparse() -> str:
-    """The protocol of 24 views: PSNR/SSIM of the field and of harmonics, the verdict, and the published PSNR of 3DGS."""
+    """The protocol of 24 views: the field, harmonics, the verdict, and 3DGS's published PSNR."""
     body = []
     for scene, (views, published) in SPARSE.items():
         runs = [trainings("twenty-four", scene, name, OWN) for name in (FIELD, "harmonics__same_rules")]
@@ -157,7 +157,7 @@ def moved() -> str:
 
 def twice() -> str:
     """PSNR by MCMC with a residual of 0.2 on the logit, and of 0.4."""
-    name, found = "MCMC, 150,000 splats: {} on the logit", records("default").values()
+    name, found = "MCMC, 150,000 splats: {} on the logit", records("trials").values()
     once, doubled = (
         {one["scene"]: one["psnr"] for one in found if one["name"] == name.format(kind)} for kind in ("once", "twice")
     )
@@ -174,7 +174,7 @@ BLOCKS = {
     "captures.floaters": floaters,
     "captures.today": summary,
     "captures.sparse": sparse,
-    "captures.run": lambda name: _run(records("default")[name]),
+    "captures.run": lambda name: _run(records("trials")[name]),
     "deviations.moved": moved,
     "deviations.twice": twice,
 }
