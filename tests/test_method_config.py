@@ -1,17 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """The menu: registered, light to import, and splatfacto's to the number."""
 
+import re
+import runpy
 import subprocess
 import sys
 from dataclasses import fields
+from importlib.metadata import entry_points
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
 import tyro
 from nerfstudio.configs import external_methods
-from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods, method_configs
+from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods, merge_methods, method_configs
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
+from nerfstudio.plugins.registry import discover_methods
 
 from nrfgs_ns.appearance.gsnb import NeuralBasis
 from nrfgs_ns.appearance.nrf import NeuralResidualField
@@ -164,3 +169,38 @@ def test_registering_pulls_in_no_gpu_code_and_no_training_tools():
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=300)
     assert run.stdout.strip().endswith("[]")
     assert "leaked" not in run.stderr
+
+
+# The entry for nerfstudio's list of external methods, in the installed nerfstudio's own loader.
+
+
+LISTING = Path(__file__).resolve().parents[1] / "docs" / "nerfstudio"
+
+
+@pytest.fixture
+def entry(monkeypatch):
+    """The entry, alone in the list."""
+    monkeypatch.setattr(external_methods, "external_methods", [])
+    runpy.run_path(str(LISTING / "external_method.py"))
+    (entry,) = external_methods.external_methods
+    return entry
+
+
+def test_it_lists_methods_that_the_package_registers(entry):
+    listed, descriptions = external_methods.get_external_methods()
+    registered, described = discover_methods()
+    assert "nrfgs" in listed and listed.keys() <= registered.keys()
+    assert listed.keys() <= set(entry_points(group="nerfstudio.method_configs").names)
+    # As nerfstudio merges them: an installed method is not replaced by its entry, and without it the entry is shown.
+    merged, _ = merge_methods(registered, described, listed, descriptions, overwrite=False)
+    assert all(merged[name] is registered[name] for name in listed)
+    alone, texts = merge_methods({}, {}, listed, descriptions, overwrite=False)
+    assert alone == listed and all(f"ns-train {name}" in texts[name] for name in listed)
+
+
+def test_the_page_is_where_the_entry_says(entry):
+    (name,) = re.findall(r"https://docs.nerf.studio/nerfology/methods/(\w+).html", entry.instructions)
+    page = (LISTING / f"{name}.md").read_text(encoding="utf-8")
+    assert f"pip install {entry.pip_package}\n" in page
+    assert all(f"`{method}`" in page or f"ns-train {method} " in page for method, _ in entry.configurations)
+    assert not re.findall(r"\]\((?!https://)", page), "links and pictures of another site"

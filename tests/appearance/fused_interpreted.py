@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The fused kernels in Triton's interpreter against PyTorch's float64 field.
 
-Run by kernels/test_interpreted.py.
+Run by kernels/test_launch.py.
 """
 
 import pytest

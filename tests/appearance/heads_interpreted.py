@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The kernels of harmonics and of the hash grid in Triton's interpreter against their twins.
 
-Run by kernels/test_interpreted.py.
+Run by kernels/test_launch.py.
 """
 
 import pytest

@@ -3,11 +3,14 @@ import math
 
 import pytest
 import torch
+from fused_cases import heads
+from fused_cases import scene as fused_scene
 from head_cases import awake, scene, shared_weights
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.head import SH_C0
 from nrfgs_ns.appearance.nrf import NrfConfig, bounded_opacity
+from nrfgs_ns.errors import InputError
 
 
 def by_hand(head, splats, visible, centers):
@@ -99,3 +102,32 @@ def test_logit_bound_is_the_residual_at_half_opacity():
 def test_impossible_settings_are_named(field, value):
     with pytest.raises(ValueError, match=f"appearance.{field} is {value!r}"):
         NrfConfig(**{field: value}).setup()
+
+
+# When the fused kernels are chosen; fused_interpreted.py tests them.
+
+
+def test_cpu_takes_torch(monkeypatch):
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    head = NrfConfig().setup()
+    splats, _, _ = fused_scene(head, 20, 15)
+    assert not head.fused.takes(splats)
+
+
+@pytest.mark.parametrize(
+    "interpreted, dtype, sizes, reason",
+    [
+        ("0", torch.float32, {}, "the splats are on cpu"),
+        ("1", torch.float64, {}, "the splats are not float32"),
+        *(
+            ("1", torch.float32, sizes, "its sizes are beyond the kernels'")
+            for sizes in ({"latent_dim": 65}, {"hidden_width": 129}, {"hidden_width": 65, "num_bands": 5})
+        ),
+    ],
+)
+def test_demanding_the_impossible_names_the_reason(interpreted, dtype, sizes, reason, monkeypatch):
+    monkeypatch.setenv("TRITON_INTERPRET", interpreted)
+    head, _ = heads(**sizes)
+    splats, visible, centers = fused_scene(head, 20, 15)
+    with pytest.raises(InputError, match=f"implementation is 'fused', but {reason}.*auto or torch"):
+        head({**splats, "latents": splats["latents"].to(dtype)}, visible, centers)

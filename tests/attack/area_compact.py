@@ -8,9 +8,8 @@ from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
-from attempt import Case
+from attempt import DAMAGES, REPLACEMENTS, Case, damage, put, replace_in
 from hypothesis import strategies as st
-from values import DAMAGES, REPLACEMENTS, damage, put, replace_in
 
 AREA = "compact file"
 

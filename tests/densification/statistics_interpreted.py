@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The kernel of the growth's statistics in Triton's interpreter against its twin.
 
-Run by kernels/test_interpreted.py.
+Run by kernels/test_launch.py.
 """
 
 import pytest

@@ -180,7 +180,7 @@ def work(rank: int, job: str, world: int, scene: Path, folder: Path, device_type
     sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "helpers"))
     import device
     import jobs
-    from quick_start import keep_what_is_imported, let_go
+    from processes import keep_what_is_imported, let_go
 
     from nrfgs_lab.many_processes import join_group
 

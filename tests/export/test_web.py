@@ -5,7 +5,6 @@ import base64
 import json
 import re
 from html.parser import HTMLParser
-from pathlib import Path
 
 import pytest
 
@@ -13,9 +12,8 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.web.command import weight_vectors
 from nrfgs_ns.export.web.guide import read_notes, read_tour
-from nrfgs_ns.export.web.page import READER, VIEWER, page
+from nrfgs_ns.export.web.page import page
 
-REPOSITORY = Path(__file__).parents[2]
 ABOUT = {"photographs": [{"name": "</script><script>alert(1)</script>.png"}], "start": 0}
 
 
@@ -55,14 +53,6 @@ def test_a_page_needs_nothing_but_itself():
 def test_a_page_in_a_folder_names_its_scene():
     text = page(ABOUT, b"", "scene.nrf", "Tea")
     assert Elements(text).scripts["packed"] == "scene.nrf" and "connect-src 'self'" in text
-
-
-def test_the_style_and_the_scripts_are_installed_with_the_package():
-    listed = re.search(r'^"nrfgs_ns.export.web" = (\[.*\])', (REPOSITORY / "pyproject.toml").read_text(), re.M)
-    patterns = json.loads(listed.group(1))
-    folder = REPOSITORY / "nrfgs_ns" / "export" / "web"
-    installed = {path.name for pattern in patterns for path in folder.glob(pattern)}
-    assert {*READER, *VIEWER, "page.html", "page.css"} <= installed
 
 
 @pytest.mark.parametrize(

@@ -264,19 +264,6 @@ def test_the_view_never_ends_inside_or_behind_the_scene(wall):
     assert page.camera()[0][0] < 19
 
 
-def test_no_frame_around_what_a_mouse_drags(wall):
-    page = wall((480, 360))
-    style = "getComputedStyle(document.getElementById('scene')).outlineStyle"
-    page.page.keyboard.press("Tab")
-    page.page.focus("#scene")
-    assert page.page.evaluate(style) == "solid", "the keyboard's place is seen"
-    page.drag()
-    assert page.page.evaluate("document.activeElement.id") == "scene"
-    assert page.page.evaluate(style) == "none"
-    page.page.keyboard.press("ArrowLeft")
-    assert page.page.evaluate(style) == "solid"
-
-
 def test_fingers_turn_move_and_zoom(on_demo):
     page = on_demo((480, 360))
     touch = devtools(page)

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Trainings of a few steps: their command line, what they leave, and whether two are the same."""
 
+import json
 from copy import deepcopy
+from functools import cache
 from pathlib import Path
+from statistics import stdev
 from typing import Any
 
 import torch
@@ -107,3 +110,39 @@ def tensors_of(tree: Any, prefix: str = "") -> dict[str, torch.Tensor]:
         return {prefix: tree}
     items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, (list, tuple)) else ()
     return {path: leaf for key, value in items for path, leaf in tensors_of(value, f"{prefix}/{key}").items()}
+
+
+# What trainings of 300 steps reach, from which bounds follow. results/smoke.json has, for each case, the PSNR of
+# trainings with several seeds, and that after one step.
+
+
+SMOKE_FILE = Path(__file__).resolve().parents[2] / "results" / "smoke.json"
+SMOKE_METHODS = "nrfgs", "nrfgs-sh", "nrfgs-vdgs", "nrfgs-gsnb", "nrfgs-sg"
+SMOKE_STEPS = 300
+PLAIN = {
+    "--pipeline.model.num-downscales": 0,
+    "--pipeline.model.few-views": "off",
+    "--pipeline.model.shrinkage": 0,
+}
+
+
+@cache
+def recorded() -> dict[str, dict[str, Any]]:
+    """Case -> "psnr" of its trainings by seed, and "after_one_step", which learns nothing."""
+    return json.loads(SMOKE_FILE.read_text(encoding="utf-8"))["records"]
+
+
+def bound(case: str) -> float:
+    """PSNR that a training of the case must exceed: four deviations below the least of those recorded.
+
+    The deviation is over seeds, the largest of the cases on the same data set.
+    """
+    group = [one for name, one in recorded().items() if name.split("/")[0] == case.split("/")[0]]
+    return min(recorded()[case]["psnr"]) - 4 * max(stdev(one["psnr"]) for one in group)
+
+
+def gain_bound(scene: str) -> float:
+    """Decibels by which the field must be above harmonics on a capture: four deviations below the least recorded."""
+    field, harmonics = (recorded()[f"{scene}/{method}"]["psnr"] for method in ("nrfgs", "nrfgs-sh"))
+    gains = [ours - theirs for ours, theirs in zip(field, harmonics, strict=True)]
+    return min(gains) - 4 * stdev(gains)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The kernels of the tiles' lists in Triton's interpreter against every pixel of every tile.
 
-Run by kernels/test_interpreted.py.
+Run by kernels/test_launch.py.
 """
 
 import quick_interpreter  # noqa: F401

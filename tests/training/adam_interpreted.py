@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Adam's kernel in Triton's interpreter against torch's Adam.
 
-Run by kernels/test_interpreted.py.
+Run by kernels/test_launch.py.
 """
 
 from copy import deepcopy

@@ -17,7 +17,7 @@ import tyro
 from nerfstudio.configs import method_configs
 from nerfstudio.plugins.registry import discover_methods
 from nerfstudio.utils import eval_utils
-from smoke_runs import recorded
+from short_trainings import recorded
 
 from nrfgs_lab.pages.options import PAGE, explanation, methods, own_options, page
 from nrfgs_lab.pages.tables import pages

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from nrfgs_lab.pages import tables
+from nrfgs_lab.pages.figures import FIGURES
 from nrfgs_lab.pages.tables import BLOCK, BLOCKS, ROOT, SHEET, declared, pages, written
 
 PAGES = {str(page.relative_to(ROOT)): page.read_text(encoding="utf-8") for page in pages()}
@@ -82,3 +83,8 @@ def test_files_that_a_page_names_are_there(name):
 def test_every_picture_is_shown():
     shown = {Path(link).name for text in PAGES.values() for link in LINK.findall(text)}
     assert {path.name for path in (ROOT / "docs" / "images").iterdir()} <= shown
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_a_figure_is_that_of_the_records(name):
+    assert FIGURES[name]() == (ROOT / "docs" / "images" / name).read_text(encoding="utf-8")
