@@ -43,6 +43,8 @@ METHODS = {
     "nrfgs-vdgs": (48, 524_288 + 1729, ["field"]),
     "nrfgs-gsnb": (48, 7760, ["features_rest", "field"]),
     "nrfgs-sg": (24, 0, ["sg_axes", "sg_sharpness", "sg_colors"]),
+    "nrfgs-deferred": (16, 38_787, ["features", "field"]),
+    "nrfgs-latent-spec": (15, 28_167, ["features", "field"]),
 }
 """Of each method: colour numbers per splat, shared weights, and groups of parameters that its head adds."""
 
