@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fused kernels in Triton's interpreter against PyTorch's float64 field.
-
-Run by kernels/test_launch.py.
-"""
+"""The fused kernels in Triton's interpreter against PyTorch's float64 field."""
 
 import pytest
 import quick_interpreter  # noqa: F401

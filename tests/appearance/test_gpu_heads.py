@@ -102,26 +102,6 @@ def test_auto_takes_the_kernels_and_falls_back():
         head(*case)
 
 
-def test_rows_beyond_32_bit_offsets():
-    """The last rows of a table of more than 2^31 latents: 9 GB, and as much again for the gradient."""
-    count = 2**26 + 5
-    if torch.cuda.mem_get_info()[0] < 30 * 2**30:
-        pytest.skip("needs 30 GB of GPU memory")
-    head, _ = heads("cuda")
-    small, _, center = scene(head, 3, 3)
-    rows = torch.arange(3, device="cuda")
-    near = evaluate(head, small, rows, center)
-    large = {name: torch.zeros(count, value.shape[1], device="cuda") for name, value in small.items()}
-    for name, table in large.items():
-        table[count - 3 :] = small[name]
-        table.requires_grad_()
-    colors, opacities = head(large, rows + count - 3, center)
-    assert torch.equal(colors, near["colors"]) and torch.equal(opacities, near["opacities"])
-    (colors.sum() + opacities.sum()).backward()
-    assert all((table.grad[count - 3 :] != 0).any() for table in large.values())
-    assert all((table.grad[: count - 3] == 0).all() for table in large.values())
-
-
 # The hash grid of VDGS.
 
 PAPER = {"levels": 4, "log2_table_size": 15, "base_resolution": 16}

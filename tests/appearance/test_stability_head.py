@@ -66,17 +66,10 @@ def assert_healthy(head, splats, center, rows=None):
 
 
 @pytest.mark.parametrize("head", HEADS)
-@settings(max_examples=12, derandomize=True)
-@given(exponent=st.floats(-30, 30), seed=st.integers(0, 99))
-def test_distances_from_1e_30_to_1e30(head, exponent, seed):
-    head, splats, center = build(head, Extreme(distance=10.0**exponent, coordinate=0.0), seed=seed)
-    assert_healthy(head, splats, center)
-
-
-@pytest.mark.parametrize("head", HEADS)
 @pytest.mark.parametrize(
     "extreme",
     [
+        *(Extreme(distance=10.0**exponent, coordinate=0.0) for exponent in (-30, -20, -12, -3, 3, 12, 19, 30)),
         *(Extreme(coordinate=at, distance=distance) for at in (1e-6, 1e6) for distance in (1e-6, 1.0, 1e6)),
         *(Extreme(latent=size) for size in (1e4, 1e10, 1e20)),
         *(Extreme(color=color) for color in (-1e18, 1e4, 1e18)),

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Captures in coordinates of the earth, and whether cameras see what training starts from."""
 
-import json
-
 import numpy as np
 import pytest
 import torch
@@ -50,20 +48,6 @@ def test_coordinates_of_the_earth_lose_nothing(tmp_path, orientation, center):
     np.testing.assert_allclose(back.places(far.metadata["points3D_xyz"]) + origin, xyz, atol=1e-5, rtol=0)
     assert np.abs(origin - UTM - (5, 6, 7)).max() < 4 and (origin == np.round(origin)).all()
     assert (to_capture(near)[1] == 0).all()
-
-
-def test_what_nerfstudio_writes_beside_the_checkpoints_leads_back(tmp_path):
-    far, xyz = with_points(tmp_path / "far", UTM)
-    outputs = far.parse()
-    outputs.save_dataparser_transform(tmp_path / "dataparser_transforms.json")
-    saved = json.loads((tmp_path / "dataparser_transforms.json").read_text())
-    transform, scale = np.array(saved["transform"]), saved["scale"]
-    back = (outputs.metadata["points3D_xyz"].numpy() / scale - transform[:, 3]) @ transform[:, :3]
-    np.testing.assert_allclose(back, xyz, atol=1e-5, rtol=0)
-    poses = outputs.transform_poses_to_original_space(outputs.cameras.camera_to_worlds, "opengl")
-    truth = {frame["file_path"][-7:]: np.array(frame["transform_matrix"]) for frame in far.meta["frames"]}
-    for path, pose in zip(outputs.image_filenames, poses.numpy(), strict=True):
-        np.testing.assert_allclose(pose, truth[path.name][:3], atol=1e-5, rtol=0)
 
 
 def test_an_applied_transform_is_part_of_the_way_back(tmp_path):

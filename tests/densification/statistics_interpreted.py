@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The kernel of the growth's statistics in Triton's interpreter against its twin.
-
-Run by kernels/test_launch.py.
-"""
+"""The kernel of the growth's statistics in Triton's interpreter against its twin."""
 
 import pytest
 import quick_interpreter  # noqa: F401

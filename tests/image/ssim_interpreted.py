@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The loss's kernels in Triton's interpreter against pytorch_msssim in float64.
 
-Run by kernels/test_launch.py. A row of a program takes about a tenth of a second there, hence the small images
+A row of a program takes about a tenth of a second there, hence the small images
 and blocks.
 """
 

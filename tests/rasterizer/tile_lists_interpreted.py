@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The kernels of the tiles' lists in Triton's interpreter against every pixel of every tile.
-
-Run by kernels/test_launch.py.
-"""
+"""The kernels of the tiles' lists in Triton's interpreter against every pixel of every tile."""
 
 import quick_interpreter  # noqa: F401
 import torch

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checkpoint files: whole or not there, and never another model in silence."""
 
+import contextlib
 import os
 import random
 import signal
@@ -177,29 +178,21 @@ def test_another_scene_is_refused(here, message):
 
 
 @pytest.mark.parametrize(
-    "name, value",
+    "name, value, may_change",
     [
-        ("pipeline.model.appearance.num_bands", 2),
-        ("pipeline.model.rasterize_mode", "antialiased"),
-        ("pipeline.datamanager.dataparser.scale_factor", 2.0),
-        ("pipeline.datamanager.camera_res_scale_factor", 0.5),
+        ("pipeline.model.appearance.num_bands", 2, False),
+        ("pipeline.model.rasterize_mode", "antialiased", False),
+        ("pipeline.datamanager.dataparser.scale_factor", 2.0, False),
+        ("pipeline.datamanager.camera_res_scale_factor", 0.5, False),
+        ("optimizers.means.optimizer.lr", 1e-5, True),
+        ("max_num_iterations", 600, True),
+        ("pipeline.model.densification.refine_every", 50, True),
+        ("pipeline.datamanager.cache_images", "cpu", True),
+        ("pipeline.model.appearance.implementation", "torch", True),
+        ("pipeline.datamanager.dataparser.data", "elsewhere", True),
     ],
 )
-def test_an_option_that_changes_the_meaning_is_refused(name, value):
-    with pytest.raises(InputError, match="--" + name.replace("_", "-") + " was .* and is "):
+def test_an_option_that_changes_the_meaning_is_refused(name, value, may_change):
+    says = pytest.raises(InputError, match="--" + name.replace("_", "-") + " was .* and is ")
+    with contextlib.nullcontext() if may_change else says:
         check_options(options_of(nrfgs.config), options_of(config_with(name, value)))
-
-
-@pytest.mark.parametrize(
-    "name, value",
-    [
-        ("optimizers.means.optimizer.lr", 1e-5),
-        ("max_num_iterations", 600),
-        ("pipeline.model.densification.refine_every", 50),
-        ("pipeline.datamanager.cache_images", "cpu"),
-        ("pipeline.model.appearance.implementation", "torch"),
-        ("pipeline.datamanager.dataparser.data", "elsewhere"),
-    ],
-)
-def test_options_of_learning_may_change_and_so_may_places(name, value):
-    check_options(options_of(nrfgs.config), options_of(config_with(name, value)))
