@@ -18,33 +18,24 @@ from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_meth
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from nerfstudio.plugins.registry import discover_methods
 
+from nrfgs_ns import method_config as menu
 from nrfgs_ns.appearance.gsnb import NeuralBasis
 from nrfgs_ns.appearance.nrf import NeuralResidualField
 from nrfgs_ns.appearance.sg import SphericalGaussians
 from nrfgs_ns.appearance.sh import SphericalHarmonics
 from nrfgs_ns.appearance.vdgs import ViewDirectionFactors
 from nrfgs_ns.densification import Splatfacto
-from nrfgs_ns.method_config import (
-    nrfgs,
-    nrfgs_best,
-    nrfgs_fast,
-    nrfgs_gsnb,
-    nrfgs_harmonics,
-    nrfgs_sg,
-    nrfgs_sh,
-    nrfgs_vdgs,
-)
 from nrfgs_ns.training.identity import leaves
 
 METHODS = {
-    "nrfgs": (nrfgs, NeuralResidualField, {"latents", "field"}),
-    "nrfgs-sh": (nrfgs_sh, SphericalHarmonics, set()),
-    "nrfgs-vdgs": (nrfgs_vdgs, ViewDirectionFactors, {"field"}),
-    "nrfgs-gsnb": (nrfgs_gsnb, NeuralBasis, {"field"}),
-    "nrfgs-sg": (nrfgs_sg, SphericalGaussians, {"sg_axes", "sg_sharpness", "sg_colors"}),
+    "nrfgs": (menu.nrfgs, NeuralResidualField, {"latents", "field"}),
+    "nrfgs-sh": (menu.nrfgs_sh, SphericalHarmonics, set()),
+    "nrfgs-vdgs": (menu.nrfgs_vdgs, ViewDirectionFactors, {"field"}),
+    "nrfgs-gsnb": (menu.nrfgs_gsnb, NeuralBasis, {"field"}),
+    "nrfgs-sg": (menu.nrfgs_sg, SphericalGaussians, {"sg_axes", "sg_sharpness", "sg_colors"}),
 }
 """Of each method: its specification, its head, and the groups of parameters that its head adds."""
-PRESETS = {"nrfgs-fast": nrfgs_fast, "nrfgs-best": nrfgs_best, "nrfgs-harmonics": nrfgs_harmonics}
+PRESETS = {"nrfgs-fast": menu.nrfgs_fast, "nrfgs-best": menu.nrfgs_best, "nrfgs-harmonics": menu.nrfgs_harmonics}
 
 
 @pytest.mark.parametrize("name", [*METHODS, *PRESETS])
@@ -65,7 +56,7 @@ def test_each_method_has_its_head_and_an_optimiser_for_all_that_it_learns(name):
 
 
 @pytest.mark.parametrize(
-    "method, kind, decay", [(nrfgs_vdgs, torch.optim.Adam, 0.0), (nrfgs_gsnb, torch.optim.AdamW, 0.01)]
+    "method, kind, decay", [(menu.nrfgs_vdgs, torch.optim.Adam, 0.0), (menu.nrfgs_gsnb, torch.optim.AdamW, 0.01)]
 )
 def test_shared_weights_of_others_have_their_references_optimisers(method, kind, decay):
     config = method.config.optimizers["field"]
@@ -127,15 +118,15 @@ def test_everything_else_is_splatfactos(name):
     ],
 )
 def test_a_preset_differs_in_what_it_says_and_shares_nothing(name, differs):
-    ours, base = dict(leaves(PRESETS[name].config)), dict(leaves(nrfgs.config))
+    ours, base = dict(leaves(PRESETS[name].config)), dict(leaves(menu.nrfgs.config))
     assert ours.keys() == base.keys()
     changed = {key: ours[key] for key in ours if str(ours[key]) != str(base[key])}
     assert changed == {"method_name": name, **differs}
-    assert PRESETS[name].config.pipeline.model.appearance is not nrfgs.config.pipeline.model.appearance
+    assert PRESETS[name].config.pipeline.model.appearance is not menu.nrfgs.config.pipeline.model.appearance
 
 
 def test_harmonics_have_all_rules_that_are_not_the_fields():
-    ours, field, plain = (dict(leaves(method.config)) for method in (nrfgs_harmonics, nrfgs, nrfgs_sh))
+    ours, field, plain = (dict(leaves(method.config)) for method in (menu.nrfgs_harmonics, menu.nrfgs, menu.nrfgs_sh))
     rules = {f"pipeline.model.{name}" for name in ("densification", "dense_start", "near_plane", "shrinkage")}
     rules |= {"max_num_iterations"}
     assert {key for key in ours if str(ours[key]) != str(plain[key])} == {"method_name", *rules}

@@ -59,15 +59,9 @@ def errors(size: int, scale: float = 1.0, views: int = 2, cameras_at_once: bool 
     return strategy.state[ERROR]
 
 
-def test_the_error_does_not_depend_on_the_size_of_images():
+def test_the_error_is_the_largest_of_a_view_whatever_the_unit_and_the_size_and_number_of_images():
     assert_close(errors(96), errors(192), rtol=0.06, atol=1e-4)
-
-
-def test_the_error_does_not_depend_on_the_unit_of_the_scene():
     assert_close(errors(64, scale=2.0), errors(64), rtol=1e-3, atol=1e-6)
-
-
-def test_the_error_is_the_largest_of_a_view_however_many_there_are():
     assert (errors(64, views=4) >= errors(64, views=2) - 1e-7).all()
     assert_close(errors(64, views=2, cameras_at_once=True), errors(64, views=2), rtol=1e-4, atol=1e-7)
 

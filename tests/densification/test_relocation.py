@@ -30,13 +30,9 @@ def test_copies_have_the_opacity_and_the_mass_of_the_one(opacity, copies):
         assert_close(torch.trapezoid(blended, x), torch.trapezoid(alone, x), rtol=5e-6, atol=0)
 
 
-def test_more_copies_than_the_limit_count_as_the_limit():
-    one = split_evenly(torch.tensor([0.5]), torch.ones(1, 3), torch.tensor([51]))
-    many = split_evenly(torch.tensor([0.5]), torch.ones(1, 3), torch.tensor([1000]))
+def test_extreme_opacities_stay_finite_and_copies_beyond_the_limit_count_as_the_limit():
+    one, many = (split_evenly(torch.tensor([0.5]), torch.ones(1, 3), torch.tensor([count])) for count in (51, 1000))
     assert torch.equal(one[0], many[0]) and torch.equal(one[1], many[1])
-
-
-def test_extreme_opacities_stay_finite():
     opacities = torch.tensor([1e-30, 1e-8, 1.0 - 6e-8, 1.0])
     each, scales = split_evenly(opacities, torch.ones(4, 3), torch.tensor([2, 51, 51, 51]))
     assert torch.isfinite(scales).all() and (scales > 0).all()

@@ -299,6 +299,11 @@ def test_slow_frames_make_pictures_coarser_until_the_camera_rests(wall):
 def test_whoever_cannot_see_the_page_is_told_what_is_there(on_demo):
     page = on_demo((900, 700))
     assert page.page.locator("html").get_attribute("lang") == "en"
+    unnamed = page.page.evaluate(
+        "[...document.querySelectorAll('button, select, input, textarea')].filter((one) => !one.labels?.length"
+        " && !one.ariaLabel && !one.textContent.trim()).map((one) => one.id)"
+    )
+    assert unnamed == []
     # The keyboard alone gets everywhere, and what happens is said.
     reached = set()
     for tab in TABS:

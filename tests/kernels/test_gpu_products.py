@@ -2,7 +2,6 @@
 """The viewer's pictures and the exported files on a CUDA device. `pytest -m gpu`. On a CPU their rooms test them."""
 
 import json
-from itertools import combinations
 from pathlib import Path
 
 import pytest
@@ -13,16 +12,7 @@ from nrfgs_lab.training_run import evaluate, parse
 from nrfgs_ns.export.command import Compact, Ply
 from nrfgs_ns.export.options import PlyOptions
 from nrfgs_ns.export.ply import read_splats
-from nrfgs_ns.viewer.pictures import (
-    AMPLIFICATION,
-    BASE,
-    DEPTH,
-    FULL,
-    VIEW_DEPENDENCE,
-    PictureOptions,
-    legends,
-    picture,
-)
+from nrfgs_ns.viewer.pictures import AMPLIFICATION, DEPTH, VIEW_DEPENDENCE, PictureOptions, legends, picture
 
 pytestmark = pytest.mark.gpu
 FROZEN = "full, as seen from another camera"
@@ -58,10 +48,6 @@ def viewer_pictures(device: str, scene: Path, out: Path) -> dict[str, torch.Tens
         pictures[name] = picture(model, camera, what)["rgb"]
         assert pictures[name].shape == (36, 48, 3) and pictures[name].device.type == device, name
         assert ((pictures[name] >= 0) & (pictures[name] <= 1)).all(), name  # NaN is in no interval
-    assert torch.equal(pictures[FULL], model.get_outputs_for_camera(camera)["rgb"])
-    assert torch.equal(pictures[BASE], model.get_base_color(camera))
-    for pair in combinations(pictures, 2):
-        assert (pictures[pair[0]] - pictures[pair[1]]).abs().max() > 0.02, pair
     return {name: value.cpu() for name, value in pictures.items()}
 
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.utils.eval_utils import eval_setup
 from short_trainings import command_line, set_up, trained
 
@@ -123,11 +122,3 @@ def test_every_picture_of_the_viewer(finished):
 def test_sizes_that_cannot_work_are_named(config):
     with pytest.raises(InputError, match="channels|diffuse_dim"):
         config.setup()
-
-
-@pytest.mark.parametrize("name", METHODS)
-def test_the_methods_are_registered_by_the_laboratory_and_have_an_optimiser_for_all_that_they_learn(name):
-    config = all_methods[name]
-    head = config.pipeline.model.appearance.setup()
-    assert type(head).__module__.startswith("nrfgs_lab.heads.")
-    assert {*head.splat_params(torch.rand(1, 3)), "field"} <= set(config.optimizers)

@@ -6,8 +6,6 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 from plyfile import PlyData
@@ -104,17 +102,6 @@ def views_above(scene, points, surfaces, count, seed=1):
     directions = np.random.default_rng(seed).normal(size=(count, len(points), 3))
     directions *= np.sign((directions * normals).sum(-1, keepdims=True))
     return directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-
-
-@settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1))
-def test_without_gloss_every_point_has_one_colour(seed):
-    scene = build_scene(SceneConfig(gloss=0.0, seed=seed % 1000, **SMALL))
-    points, surfaces = surface_points(scene, 100, seed)
-    views = views_above(scene, points, surfaces, 4, seed)
-    first, *others = [scene.outgoing_radiance(points, surfaces, v) for v in views]
-    for other in others:
-        np.testing.assert_array_equal(other, first)
 
 
 def view_variance(gloss):
