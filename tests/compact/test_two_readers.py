@@ -148,14 +148,8 @@ def containers() -> Iterator[tuple[str, bytes]]:
     for name, change in {
         "in another order": lambda h, b: (h["streams"].reverse(), b.reverse()),
         "a stream twice": lambda h, b: (h["streams"].append(dict(h["streams"][0])), b.append(b[0])),
-        "a stream of another name": lambda h, b: (
-            h["streams"].append({**h["streams"][0], "name": "x"}),
-            b.append(b[0]),
-        ),
-        "a weight too many": lambda h, b: (
-            h["streams"].append({**h["streams"][-1], "name": "head.x"}),
-            b.append(b[-1]),
-        ),
+        "of another name": lambda h, b: (h["streams"].append({**h["streams"][0], "name": "x"}), b.append(b[0])),
+        "a weight": lambda h, b: (h["streams"].append({**h["streams"][-1], "name": "head.x"}), b.append(b[-1])),
         "a stream less": lambda h, b: (h["streams"].pop(), b.pop()),
     }.items():
         header, bodies = parts()
@@ -246,15 +240,8 @@ def rans_streams() -> Iterator[tuple[str, bytes]]:
         for sizes in ((0, 0), (2**32 - 1, size), (count, 2**32 - 1), (2**30, 8)):
             yield f"{name}: sizes {sizes}", with_body(name, lambda b, s=sizes: MODEL.pack(*s) + b[8:])
         rows = {"means": 2, "splats": 10, "latents": 8}[name]
-        for shape in (
-            [rows, 10**6],
-            [10**6, 1],
-            [1024, 2000],
-            [rows, 0],
-            [0, COUNT],
-            [rows, COUNT - 1],
-            [rows - 1, COUNT],
-        ):
+        near = [rows, 0], [0, COUNT], [rows, COUNT - 1], [rows - 1, COUNT]
+        for shape in ([rows, 10**6], [10**6, 1], [1024, 2000], *near):
             yield f"{name}: shape {shape}", with_body(name, lambda body: body, shape=shape)
         for dtype in ("int16", "int32", "uint32"):
             yield f"{name}: {dtype}", with_body(name, lambda body: body, dtype=dtype)
@@ -306,10 +293,8 @@ def contents() -> Iterator[tuple[str, bytes]]:
     for name, grid in fields["grids"].items():
         for part in ("low", "step"):
             for value in (1e-320, 1e37, 1e38, 3.5e38, 1e308, -1e38, 0):
-                yield (
-                    f"{name} {part} {value}",
-                    with_stream("", None, **{f"grids__{name}__{part}": [value] * len(grid[part])}),
-                )
+                changed = {f"grids__{name}__{part}": [value] * len(grid[part])}
+                yield f"{name} {part} {value}", with_stream("", None, **changed)
 
 
 def whole_files() -> Iterator[tuple[str, bytes]]:

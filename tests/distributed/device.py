@@ -154,12 +154,7 @@ def statistics(model, info) -> dict:
 
 
 def train(scene: Path, out: Path, world: int, steps: int, load: Path | None = None, watch=None, **options):
-    """Train for some steps; the trainer.
-
-    Args:
-        load: folder of checkpoints to go on from.
-        watch: called with the trainer before it trains.
-    """
+    """The trainer after some steps, from a folder of checkpoints; `watch` is called with it before it trains."""
     more = {"--max-num-iterations": steps, **BUSY, **options, **({"--load-dir": load} if load else {})}
     trainer = trainer_of(scene, out, world, **more)
     if watch is not None:

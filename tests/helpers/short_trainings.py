@@ -42,15 +42,9 @@ LOUD = {
 
 
 def command_line(method: str, scene: Path, out: Path, steps: int, *options: dict[str, Any]) -> list[str]:
-    """Words after `ns-train` of a quiet training.
+    """Words after `ns-train` of a quiet training; `steps` include those before the checkpoint that it goes on from.
 
-    Args:
-        method: name of a registered method.
-        scene: folder of the data set.
-        out: folder for what the training writes.
-        steps: of the whole training, including those before the checkpoint that it goes on from.
-        options: values by option, dashes included; of several the last counts, and None takes the option away ("None"
-            is a value).
+    Options are values by option, dashes included; of several the last counts, and None takes the option away.
     """
     chosen = {"--data": scene, "--output-dir": out, "--max-num-iterations": steps, **QUIET}
     for more in options:

@@ -13,7 +13,7 @@ from gsplat_call import rasterization
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nrfgs_ns.rasterizer import ProjectionOptions, project
+from nrfgs_ns.rasterizer import ProjectionOptions, gsplat_cuda, project
 from nrfgs_ns.rasterizer.torch_cpu import compositing, tiles
 from nrfgs_ns.rasterizer.torch_cpu.projection import MIN_QUATERNION
 
@@ -195,55 +195,46 @@ def test_a_splat_that_is_not_finite_is_not_there(device, mode, value, name):
         assert 0 not in info["gaussian_ids"]
 
 
-def test_rows_that_gsplat_lets_through_as_nan_are_projected_away(monkeypatch):
-    """gsplat's comparisons let NaN pass. A stand-in for its kernel does the same; the back end takes those rows out."""
-    from nrfgs_ns.rasterizer import gsplat_cuda
-
+@pytest.fixture
+def calls(monkeypatch):
+    """Rows that gsplat's projection is asked for. A stand-in for its kernel lets NaN pass, as its comparisons do."""
     calls = []
 
     def kernel(means, covars, quats, scales, viewmats, Ks, width, height, **settings):
+        assert len(means) > 0, "1.5.3 divides by the number of splats: the process would end without a word"
         calls.append(len(means))
         harmless = [torch.nan_to_num(table, 0.5, 0.5, 0.5) for table in (means, quats, scales)]
         p = project(*harmless, viewmats, Ks, width, height)
-        spoilt = ~torch.isfinite(means[p.gaussian_ids]).all(1)
-        conics = p.conics.masked_fill(spoilt[:, None], math.nan)
-        if gsplat_cuda.HAS_BATCHES:
-            sides = p.radii[:, None].expand(-1, 2)
-            return p.camera_ids, p.camera_ids, p.gaussian_ids, sides, p.means2d, p.depths, conics, None
-        return p.camera_ids, p.gaussian_ids, p.radii, p.means2d, p.depths, conics, None
+        conics = p.conics.masked_fill(~torch.isfinite(means[p.gaussian_ids]).all(1)[:, None], math.nan)
+        radii = p.radii[:, None].expand(-1, 2) if gsplat_cuda.HAS_BATCHES else p.radii
+        rows = p.camera_ids, p.gaussian_ids, radii, p.means2d, p.depths, conics
+        return *(rows[:1] if gsplat_cuda.HAS_BATCHES else ()), *rows, p.depths
 
     monkeypatch.setattr(gsplat_cuda, "fully_fused_projection", kernel)
-    splats = cloud(means=math.nan)
-    p = gsplat_cuda.project([splats[name] for name in NAMES[:3]], camera(), ProjectionOptions())
+    return calls
+
+
+def gsplats(splats, options=None):
+    return gsplat_cuda.project([splats[name] for name in NAMES[:3]], camera(), options or ProjectionOptions())
+
+
+def test_rows_that_gsplat_lets_through_as_nan_are_projected_away(calls):
+    p = gsplats(cloud(means=math.nan))
     assert p.gaussian_ids.tolist() == [1, 2, 3, 4, 5] and calls == [6, 5]
     assert torch.isfinite(p.conics).all()
-    sound = cloud()
-    gsplat_cuda.project([sound[name] for name in NAMES[:3]], camera(), ProjectionOptions())
+    gsplats(cloud())
     assert calls == [6, 5, 6]  # no second look where nothing is wrong
-    in_training = ProjectionOptions(assume_finite=True)  # a training's guard finds such splats
-    gsplat_cuda.project([splats[name] for name in NAMES[:3]], camera(), in_training)
+    gsplats(cloud(means=math.nan), ProjectionOptions(assume_finite=True))  # a training's guard finds such splats
     assert calls == [6, 5, 6, 6]
 
 
 @modes
-@pytest.mark.parametrize("bad", [None, math.nan])
-def test_gsplats_projection_never_sees_an_empty_table(monkeypatch, mode, bad):
-    """1.5.3 divides by the number of splats: the process would end without a word."""
-    from nrfgs_ns.rasterizer import gsplat_cuda
-
-    def kernel(means, covars, quats, scales, viewmats, Ks, width, height, **settings):
-        assert len(means) > 0
-        ids = torch.arange(len(means))
-        sides = torch.ones(len(means), 2, dtype=torch.int32)
-        rows = (ids * 0, ids, sides if gsplat_cuda.HAS_BATCHES else sides[:, 0], means[:, :2], means[:, 2], scales)
-        return *(rows[:1] if gsplat_cuda.HAS_BATCHES else ()), *rows, means[:, 2]
-
-    monkeypatch.setattr(gsplat_cuda, "fully_fused_projection", kernel)
-    count = 0 if bad is None else 2
+@pytest.mark.parametrize("count", [0, 2])
+def test_gsplats_projection_never_sees_an_empty_table(calls, mode, count):
+    """Of no splat, or of NaN alone."""
     splats = {name: value.detach()[:count].requires_grad_() for name, value in cloud().items()}
-    if bad is not None:
-        splats["means"] = torch.full((2, 3), bad, requires_grad=True)
-    p = gsplat_cuda.project([splats[name] for name in NAMES[:3]], camera(), ProjectionOptions(mode))
+    splats["means"] = torch.full((count, 3), math.nan, requires_grad=True)
+    p = gsplats(splats, ProjectionOptions(mode))
     assert p.gaussian_ids.shape == (0,) and p.means2d.shape == (0, 2) and p.conics.shape == (0, 3)
     assert p.radii.shape == (0,) and p.radii.dtype == torch.int32
     assert (p.compensations is None) == (mode == "classic")
