@@ -60,15 +60,12 @@ def declared(about: Message, *extras: str) -> dict[str, Requirement]:
     }
 
 
-def test_every_file_of_the_packages_is_in_it(wheel):
+def test_every_file_of_the_packages_is_in_it_and_entry_points_name_some(wheel):
     files = itertools.chain.from_iterable((ROOT / package).rglob("*") for package in PACKAGES)
     needed = {path.relative_to(ROOT).as_posix() for path in files if path.is_file() and path.suffix != ".pyc"}
     inside = {name for name in wheel.namelist() if ".dist-info/" not in name}
     assert inside == needed
     assert any(name.endswith("/LICENSE") for name in wheel.namelist())
-
-
-def test_entry_points_name_what_is_in_it(wheel):
     text = wheel.read(next(name for name in wheel.namelist() if name.endswith("/entry_points.txt"))).decode()
     targets = [line.split(" = ")[1] for line in text.splitlines() if " = " in line]
     for module, _, name in (target.partition(":") for target in targets):

@@ -35,14 +35,11 @@ def test_sum_ignores_higher_coefficients(degree):
     assert_close(eval_sh(degree, 3.0 * unit(50), coefficients), expected, rtol=0, atol=1e-12)
 
 
-def test_degree_ramp_is_splatfactos():
+def test_degree_ramp_is_splatfactos_and_an_impossible_degree_is_named():
     head = ShConfig(degree=3, degree_interval=1000).setup()
     for step, degree in ((0, 0), (999, 0), (1000, 1), (2500, 2), (3000, 3), (30_000, 3)):
         head.set_step(step)
         assert head.active_degree == degree
-
-
-def test_impossible_degree_is_named():
     with pytest.raises(ValueError, match="appearance.degree is 4"):
         ShConfig(degree=4).setup()
 

@@ -80,16 +80,13 @@ def test_zero_outputs_add_nothing():
     assert awake(NrfConfig()).neutral_loss(splats, visible, centers) > 0.0
 
 
-def test_straight_through_is_a_clamp_whose_gradient_ignores_it():
+def test_straight_through_is_a_clamp_whose_gradient_ignores_it_and_logit_the_residual_at_half_opacity():
     logit = torch.tensor([[-3.0], [0.0], [3.0]], dtype=torch.double)
     residual = torch.tensor([[-1.0], [0.5], [1.0]], dtype=torch.double, requires_grad=True)
     opacity = bounded_opacity(logit, residual, 0.2, "straight-through")
     assert_close(opacity.detach().squeeze(), torch.tensor([0.0, 0.6, 1.0], dtype=torch.double))
     opacity.sum().backward()
     assert residual.grad.squeeze().tolist() == [0.2, 0.2, 0.2]
-
-
-def test_logit_bound_is_the_residual_at_half_opacity():
     residual = torch.tensor([[1e-4]], dtype=torch.double)
     opacity = bounded_opacity(torch.zeros(1, 1, dtype=torch.double), residual, 0.2, "logit")
     # The sigmoid has no second derivative at 0; the third leaves (4 * 0.2e-4)^3 / 48.

@@ -56,7 +56,7 @@ def test_any_table_comes_back(columns, rows, largest, signed, seed):
     assert (decode_table(*encode_table(table, signed), columns, rows) == table).all()
 
 
-def test_it_takes_what_entropy_says():
+def test_it_takes_what_entropy_says_and_less_with_neighbours():
     """Independent numbers cannot take less than their entropy; this takes 1 % more, and a model."""
     random = np.random.default_rng(3)
     table = np.rint(random.laplace(size=(4, 50_000)) * 3).astype(np.int64)
@@ -65,9 +65,6 @@ def test_it_takes_what_entropy_says():
     entropy = -(counts * np.log2(counts / counts.sum())).sum() / 8
     assert entropy * 0.999 < len(data) < entropy * 1.01
     assert len(model) < 2000
-
-
-def test_neighbours_are_worth_something():
     table = laplacian(3, 30_000)
     shuffled = table[:, np.random.default_rng(0).permutation(30_000)]
     assert len(encode_table(table)[1]) < 0.8 * len(encode_table(shuffled)[1])

@@ -62,13 +62,10 @@ def test_points_lie_on_what_the_views_show_in_any_unit(unit):
     torch.testing.assert_close(rgb[off < 0.003], texture(xyz[:, 0], xyz[:, 1])[off < 0.003], atol=0.1, rtol=0)
 
 
-def test_exposure_does_not_matter():
+def test_exposure_does_not_matter_and_nothing_is_found_where_nothing_can_be_told():
     even, _ = dense_points(*plane(AROUND), share=1.0)
     uneven, _ = dense_points(*plane(AROUND, brightness=(1.0, 0.7, 0.9)), share=1.0)
     assert len(uneven) == pytest.approx(len(even), rel=0.05)
-
-
-def test_nothing_is_found_where_nothing_can_be_told():
     same_place = plane([(0.0, 0.0)] * 4)
     plain = plane(AROUND, pattern=lambda x, y: 0.5 + 0 * torch.stack([x, y, x], dim=-1))
     masked, points = plane(AROUND)

@@ -186,12 +186,9 @@ def test_opacities_decay_less_and_less():
     assert taken == pytest.approx([DECAY * (1 - step / 30_000) for step in (600, 15_000, 24_800)], abs=1e-6)
 
 
-def test_a_budget_above_the_cap_is_refused():
+def test_growth_ends_at_the_cap_and_in_time():
     with pytest.raises(InputError, match="budget is 50; it must be at most most_splats, 40"):
         ErrorGuided(budget=50, most_splats=40).check()
-
-
-def test_growth_ends_at_the_cap_and_in_time():
     for step, options, count in ((600, {"most_splats": 43}, 43), (15_000, {}, 40), (25_000, {}, 40)):
         table, strategy = Table(40), rules(**options)
         refine(table, strategy, step, gradient=1.0)

@@ -99,7 +99,7 @@ def test_layout_is_that_of_3dgs(tmp_path):
     assert_close(read_splats(tmp_path / "deep" / "splats.ply"), splats, rtol=0, atol=0)
 
 
-def test_splats_that_cannot_be_drawn_are_left_out(tmp_path):
+def test_splats_that_cannot_be_drawn_are_left_out_also_of_a_turned_scene(tmp_path):
     splats = plain_splats(6)
     splats.quats[1] = math.nan  # there was no direction
     splats.features_rest[2, 7, 1] = math.inf
@@ -111,9 +111,6 @@ def test_splats_that_cannot_be_drawn_are_left_out(tmp_path):
     with pytest.raises(InputError, match="none of the 6 splats"):
         write_splats(splats, tmp_path / "none.ply")
     assert not list(tmp_path.glob("none.ply*"))
-
-
-def test_a_splat_without_a_rotation_is_left_out_of_a_turned_scene(tmp_path):
     splats = plain_splats(4)
     splats.quats[2] = 0.0
     assert write_splats(Y_DOWN.moved(splats), tmp_path / "splats.ply") == 3

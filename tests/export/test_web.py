@@ -34,7 +34,7 @@ class Elements(HTMLParser):
             self.scripts.setdefault(attributes.get("id"), data)
 
 
-def test_a_page_needs_nothing_but_itself():
+def test_a_page_needs_nothing_but_itself_or_names_its_scene():
     scene = bytes(range(256)) * 10
     text = page(ABOUT, b"a picture", scene, "Tea & <cakes>", 'Me "and" you')
     elements = Elements(text)
@@ -47,9 +47,6 @@ def test_a_page_needs_nothing_but_itself():
     policy = next(dict(attributes)["content"] for _, attributes in elements.tags if "http-equiv" in attributes)
     assert "default-src 'none'" in policy and "connect-src 'none'" in policy
     assert "{{" not in text.replace(elements.scripts["packed"], "")
-
-
-def test_a_page_in_a_folder_names_its_scene():
     text = page(ABOUT, b"", "scene.nrf", "Tea")
     assert Elements(text).scripts["packed"] == "scene.nrf" and "connect-src 'self'" in text
 

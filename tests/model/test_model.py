@@ -136,11 +136,18 @@ def test_training_resolution_follows_the_schedule(build):
         assert torch.isfinite(pipeline.model.get_loss_dict(outputs, batch)["main_loss"])
 
 
-def test_intrinsics_shrink_with_the_image():
+def test_intrinsics_shrink_with_the_image_and_poses_are_inverted_with_y_and_z_flipped():
     camera = Cameras(torch.eye(4)[None, :3], fx=100.0, fy=90.0, cx=50.0, cy=31.0, width=101, height=63)[0:1]
     seen_from = pinhole(camera, camera.camera_to_worlds, 2)
     assert (seen_from.width, seen_from.height) == (50, 31)
     assert_close(seen_from.K[0], torch.tensor([[50.0, 0, 25], [0, 45, 15.5], [0, 0, 1]]))
+    rotation = torch.linalg.qr(torch.randn(3, 3))[0]
+    pose = torch.cat([rotation, torch.randn(3, 1)], dim=1)[None]
+    matrix = world_to_camera(pose)[0]
+    ahead = pose[0, :, 3] - 2 * rotation[:, 2]  # nerfstudio looks along -z
+    assert_close(matrix @ torch.cat([ahead, torch.ones(1)]), torch.tensor([0.0, 0, 2, 1]), atol=1e-5, rtol=0)
+    above = pose[0, :, 3] + rotation[:, 1]
+    assert_close(matrix @ torch.cat([above, torch.ones(1)]), torch.tensor([0.0, -1, 0, 1]), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("batched", [True, False])
@@ -162,16 +169,6 @@ def test_a_camera_on_the_gpu_is_asked_once_until_it_is_written_to():
     assert pinholes.fixed(camera, gpu) is first
     camera.camera_to_worlds[0, 0, 3] = 7.0
     assert pinholes.fixed(camera, gpu).center.tolist() == [7.0, 0.0, 0.0]
-
-
-def test_world_to_camera_inverts_the_pose_and_flips_y_and_z():
-    rotation = torch.linalg.qr(torch.randn(3, 3))[0]
-    pose = torch.cat([rotation, torch.randn(3, 1)], dim=1)[None]
-    matrix = world_to_camera(pose)[0]
-    ahead = pose[0, :, 3] - 2 * rotation[:, 2]  # nerfstudio looks along -z
-    assert_close(matrix @ torch.cat([ahead, torch.ones(1)]), torch.tensor([0.0, 0, 2, 1]), atol=1e-5, rtol=0)
-    above = pose[0, :, 3] + rotation[:, 1]
-    assert_close(matrix @ torch.cat([above, torch.ones(1)]), torch.tensor([0.0, -1, 0, 1]), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5])

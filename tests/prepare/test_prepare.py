@@ -382,12 +382,17 @@ def test_a_photograph_that_colmap_leaves_out_is_named(tmp_path):
         structure.extract_features(database, tmp_path, both, lambda _: None, "SIMPLE_RADIAL", True, 1600, 100)
 
 
-def test_names_stay_different_and_short():
+def test_names_stay_different_and_one_camera_needs_all_to_agree_with_damaged_exif_as_none(tmp_path):
     given = ["00002_a_b.jpg", "a b.jpg", "a_b.jpg", "a_b.jpeg", "\udcff.jpg"]
     given += [f"{letters}.jpg" for letters in ("ä" * 100, "ö" * 100, "x" * 250)]
     names = photos.stored_names([Path(name) for name in given])
     assert len(set(names)) == len(given)
     assert all(name.isascii() and len(name) < 150 and "?" not in name for name in names)
+    exif = b"Exif\0\0II*\0\x08\0\0\0\xff\xff" + bytes(range(200))
+    paths = [photo(tmp_path / "in" / f"{i}.jpg", size, exif=exif) for i, size in enumerate([(40, 30)] * 2 + [(30, 40)])]
+    photos.import_photos(paths, tmp_path / "stored", lambda _: None)
+    assert photos.same_camera(tmp_path / "stored", ["0.jpg", "1.jpg"])
+    assert not photos.same_camera(tmp_path / "stored", ["0.jpg", "2.jpg"])
 
 
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 50 50\nshowpage\n"
@@ -406,14 +411,6 @@ def test_what_is_no_photograph_is_named(three, tmp_path, make, said):
     make(three / "1.png")
     with pytest.raises(InputError, match=f"1.png.*{said}"):
         Run(Prepare(three, tmp_path / "out"), Console(quiet=True)).import_input()
-
-
-def test_one_camera_only_where_everything_agrees_and_damaged_exif_is_none(tmp_path):
-    exif = b"Exif\0\0II*\0\x08\0\0\0\xff\xff" + bytes(range(200))
-    paths = [photo(tmp_path / "in" / f"{i}.jpg", size, exif=exif) for i, size in enumerate([(40, 30)] * 2 + [(30, 40)])]
-    photos.import_photos(paths, tmp_path / "stored", lambda _: None)
-    assert photos.same_camera(tmp_path / "stored", ["0.jpg", "1.jpg"])
-    assert not photos.same_camera(tmp_path / "stored", ["0.jpg", "2.jpg"])
 
 
 def test_the_sharpest_frame_of_each_piece_of_a_video_is_taken(tmp_path):

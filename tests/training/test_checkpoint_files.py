@@ -74,7 +74,7 @@ def test_a_damaged_newest_falls_back_to_the_one_before(tmp_path, capsys):
         read_latest(tmp_path)
 
 
-def test_code_in_a_checkpoint_is_not_run(tmp_path):
+def test_code_in_a_checkpoint_is_not_run_and_what_is_not_there_is_refused(tmp_path):
     class Attack:
         def __reduce__(self):
             return os.mkdir, (str(tmp_path / "owned"),)
@@ -83,9 +83,6 @@ def test_code_in_a_checkpoint_is_not_run(tmp_path):
     with pytest.raises(Damaged):
         read(tmp_path / "step-000000001.ckpt")
     assert not (tmp_path / "owned").exists()
-
-
-def test_a_step_that_is_not_there_and_a_folder_in_place_of_a_file_are_refused(tmp_path):
     write(tmp_path, 1, content(1))
     with pytest.raises(InputError, match="no checkpoint of step 5, only of 1"):
         read_latest(tmp_path, step=5)

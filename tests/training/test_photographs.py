@@ -52,14 +52,11 @@ def test_the_evidence_decides(pairs, known, wanted, words):
     assert evidence.calls_for_learning == wanted and words in evidence.numbers
 
 
-def test_exposure_in_stops():
+def test_exposure_in_stops_of_exif_from_the_data_set_or_else_from_the_file(tmp_path):
     exif = {"exposure_time": 0.01, "iso": 100, "f_number": 4.0}
     assert exposure({**exif, "exposure_time": 0.02, "iso": 200}) - exposure(exif) == pytest.approx(2.0)
     assert exposure({**exif, "f_number": 2.0}) - exposure(exif) == pytest.approx(2.0)
     assert math.isnan(exposure({"f_number": 2.0, "iso": 100})) and math.isnan(exposure({}))
-
-
-def test_exif_comes_from_the_data_set_or_else_from_the_file(tmp_path):
     photo = tmp_path / "a.jpg"
     exif = Image.Exif()
     exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.ExposureTime] = 0.25

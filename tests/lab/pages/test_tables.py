@@ -54,10 +54,12 @@ def test_a_number_that_is_not_the_record_s_is_noticed():
     assert changed != text and written(changed) == text
 
 
-def test_every_block_is_on_a_page():
+def test_every_block_and_picture_is_on_a_page():
     used = {match[1] + (match[2] or "") for text in PAGES.values() for match in BLOCK.finditer(text)}
     assert set(declared()) <= used
     assert set(BLOCKS) <= {name.partition("(")[0] for name in used}
+    shown = {Path(link).name for text in PAGES.values() for link in LINK.findall(text)}
+    assert {path.name for path in (ROOT / "docs" / "images").iterdir()} <= shown
 
 
 def test_every_record_is_shown_or_used():
@@ -78,11 +80,6 @@ def test_files_that_a_page_names_are_there(name):
     paths = [path for path in paths if "NAME" not in path]
     paths += [module.replace(".", "/") for module in modules]
     assert [path for path in paths if not any((ROOT / f"{path}{end}").exists() for end in ("", ".py"))] == []
-
-
-def test_every_picture_is_shown():
-    shown = {Path(link).name for text in PAGES.values() for link in LINK.findall(text)}
-    assert {path.name for path in (ROOT / "docs" / "images").iterdir()} <= shown
 
 
 @pytest.mark.parametrize("name", FIGURES)
