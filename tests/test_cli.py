@@ -76,8 +76,6 @@ def test_a_training_is_named_in_any_form(tmp_path, monkeypatch, capsys):
 
 
 # Messages for the user, and files written whole.
-
-
 RAISE = "from nrfgs_ns.errors import InputError\nraise InputError('x.json is missing. Make one.')"
 
 

@@ -163,8 +163,6 @@ def test_registering_pulls_in_no_gpu_code_and_no_training_tools():
 
 
 # The entry for nerfstudio's list of external methods, in the installed nerfstudio's own loader.
-
-
 LISTING = Path(__file__).resolve().parents[1] / "docs" / "nerfstudio"
 
 

@@ -6,17 +6,7 @@ import quick_interpreter  # noqa: F401
 import torch
 import triton
 import triton.language as tl
-from fused_cases import (
-    ULP,
-    assert_near,
-    compare,
-    evaluate,
-    float32_tolerance,
-    heads,
-    relative_errors,
-    rounding,
-    scene,
-)
+from fused_cases import ULP, assert_near, compare, evaluate, float32_tolerance, heads, relative_errors, rounding, scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -63,8 +63,6 @@ def test_what_is_no_lattice_coordinate():
 
 
 # Harmonics.
-
-
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize(("splats", "highest"), [(0, 3), (1, 3), (200, 3), (130, None)])
 def test_colours_and_gradients_are_those_of_the_twin(degree, splats, highest):

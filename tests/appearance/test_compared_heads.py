@@ -45,8 +45,6 @@ def test_degree_ramp_is_splatfactos_and_an_impossible_degree_is_named():
 
 
 # GSNB.
-
-
 def gsnb_by_hand(head, splats, visible, centers, ramp):
     """The formulas, one splat at a time, with nothing shared with the implementation but the weights."""
     first, _, second, _, third, _ = head.basis
@@ -87,8 +85,6 @@ def test_learnt_functions_use_the_coefficients_of_degrees_that_are_still_off():
 
 
 # SG.
-
-
 def sg_by_hand(splats, visible, centers):
     """The formula, one splat and one lobe at a time, in Python's own arithmetic."""
     colors = []
@@ -154,8 +150,6 @@ def test_before_its_step_there_is_the_base_alone_and_no_gradient_to_the_lobes():
 
 
 # VDGS.
-
-
 def grid_by_hand(table, x):
     """The paper's four levels at one position, corner by corner, the hash in unsigned 32-bit integers."""
     features = []

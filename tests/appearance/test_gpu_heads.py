@@ -103,7 +103,6 @@ def test_auto_takes_the_kernels_and_falls_back():
 
 
 # The hash grid of VDGS.
-
 PAPER = {"levels": 4, "log2_table_size": 15, "base_resolution": 16}
 
 

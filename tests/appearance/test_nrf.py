@@ -102,8 +102,6 @@ def test_impossible_settings_are_named(field, value):
 
 
 # When the fused kernels are chosen; fused_interpreted.py tests them.
-
-
 def test_cpu_takes_torch(monkeypatch):
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
     head = NrfConfig().setup()

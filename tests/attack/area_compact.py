@@ -100,12 +100,7 @@ CLAIMS = {
     ("head", "config", "_target"): ("os.system",),
 }
 """Place in the header -> values that it cannot have. compact/test_two_readers.py has more."""
-TEXTS = {
-    "deep": b"[" * 200_000,
-    "no JSON": b"{",
-    "a list": b"[]",
-    "5,000 digits": b'{"streams": ' + b"9" * 5000 + b"}",
-}
+TEXTS = {"deep": b"[" * 200_000, "no JSON": b"{", "a list": b"[]", "5,000 digits": b'{"streams": ' + b"9" * 5000 + b"}"}
 CASES = [
     replaced("bomb of bytes", "means", 2**28, lambda: zeros(2**28), dtype="uint8", coding="xz"),
     replaced("bomb of words", "latents", 2**25, lambda: zeros(2**28), dtype="uint64", coding="xz"),

@@ -181,8 +181,6 @@ def _read(case: Case, folder: Path) -> Outcome:
 
 
 # Values that nobody expects, and ways to put them where something else was.
-
-
 ODD = st.sampled_from(
     [None, True, False, 0, -1, 1, 2, 7, 2**31, 2**63, 10**30, 10**400, -0.0, 0.5, 1e-320, 1e38, 1e39, 1e308, -1e308]
     + [float("nan"), float("inf"), "", "x", "nan", "1e400", "\0", "\ud800", "\u202e", "a\nb", "x" * 300, "/", "..", "."]

@@ -135,8 +135,6 @@ def test_a_file_alone_is_in_its_own_unit_of_length(tmp_path):
 
 
 # The command.
-
-
 @pytest.fixture(scope="module")
 def exported(tiny_scene, tmp_path_factory):
     """config.yml of an 8-step training with a loud field, the compact file, and the report."""

@@ -23,8 +23,6 @@ def manager(capture, parser_options=None, **options) -> NrfgsDatamanager:
 
 
 # Images.
-
-
 @pytest.mark.parametrize("scale", [1.0, 0.5])
 @pytest.mark.parametrize("mode", ["RGB", "RGBA", "L"])
 @pytest.mark.parametrize("kind", ["uint8", "float32"])
@@ -134,8 +132,6 @@ def test_undistorted_images_can_be_read_again(capture):
 
 
 # The order of cameras.
-
-
 def next_cameras(data, count: int) -> list[int]:
     return [data.next_train(0)[0].metadata["cam_idx"] for _ in range(count)]
 
@@ -166,8 +162,6 @@ def test_order_continues_after_a_restore(capture, strategy, steps):
 
 
 # Where images are kept.
-
-
 @pytest.mark.parametrize("distorted", [False, True])
 def test_images_in_files_are_those_in_memory(capture, tmp_path, monkeypatch, printed, distorted):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

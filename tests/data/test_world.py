@@ -61,8 +61,6 @@ def test_an_applied_transform_is_part_of_the_way_back(tmp_path):
 
 
 # What the cameras see.
-
-
 def turn_away(frame) -> None:
     matrix = np.array(frame["transform_matrix"])
     matrix[:3, [0, 2]] *= -1
@@ -104,8 +102,6 @@ def test_empty_masks_are_named(tmp_path, printed):
 
 
 # Fisheyes.
-
-
 @pytest.mark.parametrize("k1", [0.0, 0.05])
 def test_a_fisheye_is_undistorted(tmp_path, k1):
     """What is in memory is what a pinhole sees of a world whose colour depends on direction."""

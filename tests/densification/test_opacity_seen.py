@@ -56,8 +56,6 @@ def test_the_peak_is_forgotten_at_refinement(name):
 
 
 # Heads whose opacity is the stored one.
-
-
 @pytest.mark.parametrize("config", [ShConfig(), GsnbConfig(), SgConfig(), NrfConfig(opacity_residual=False)])
 def test_heads_of_stored_opacity_change_nothing(config):
     """Exactly: 21 of 37 splats, so that they do not lie in the vectors and tails of a loop where the table has them."""
@@ -74,8 +72,6 @@ def test_heads_of_stored_opacity_change_nothing(config):
 
 
 # Heads that change it.
-
-
 def test_what_is_seen_is_what_was_shown():
     """By the change and the stored opacity from which it came; extremes included. A difference of two numbers up to 1,
     and a quotient below 1, are each rounded by up to 6e-8, three times in all."""

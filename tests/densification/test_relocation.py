@@ -52,8 +52,6 @@ def test_noise_has_the_splats_shape_and_spares_what_is_visible():
 
 
 # What happens to the rows.
-
-
 def test_relocated_splats_become_copies_of_live_ones():
     table = Table(50)
     dead = torch.zeros(50, dtype=torch.bool)

@@ -19,8 +19,6 @@ pytestmark = pytest.mark.usefixtures("no_cuda")
 
 
 # What happens to the rows.
-
-
 @pytest.mark.parametrize("name", STRATEGIES)
 def test_every_tensor_of_the_table_goes_along(name):
     """Small splats with large gradients are duplicated, large ones split, faint ones pruned or moved."""
@@ -69,8 +67,6 @@ def test_mcmc_rests_before_its_start_and_after_its_end():
 
 
 # Thresholds.
-
-
 def test_original_measures_by_the_cameras():
     """3DGS: 1.1 times the largest distance of a camera from the mean of all."""
     rules = strategy("original")
@@ -112,8 +108,6 @@ def test_original_keeps_its_calendar():
 
 
 # The option on the command line.
-
-
 @pytest.mark.parametrize(
     "text, config",
     [
@@ -177,8 +171,6 @@ def test_statistics_growth_and_resets_are_gsplats():
 
 
 # A budget of the gradient's rules.
-
-
 def simulated(rules, table: Table, steps: range, seed: int = 0) -> list[int]:
     """Refine a table at these steps; its gradients are drawn anew each time. Returns its sizes."""
     sizes = []

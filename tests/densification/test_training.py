@@ -92,8 +92,6 @@ def test_another_strategies_checkpoint_is_refused(tiny_scene, tmp_path):
 
 
 # The statistics' kernels on a GPU.
-
-
 def one_view() -> dict:
     """What a camera saw: 3000 of 5000 splats, some of them of no size."""
     torch.manual_seed(0)

@@ -101,8 +101,6 @@ def test_transfers_end_in_balance_and_lose_nobody(counts):
 
 
 # Two GPUs with NCCL between them: the step of one process, and a training that densifies.
-
-
 def gpus(test):
     return pytest.mark.gpu(pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")(test))
 

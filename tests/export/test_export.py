@@ -75,8 +75,6 @@ def model_on(scene: Path, out: Path, method: str = "nrfgs", *options: str):
 
 
 # The file.
-
-
 def test_layout_is_that_of_3dgs(tmp_path):
     splats = plain_splats(7)
     assert write_splats(splats, tmp_path / "deep" / "splats.ply") == 7
@@ -117,8 +115,6 @@ def test_splats_that_cannot_be_drawn_are_left_out_also_of_a_turned_scene(tmp_pat
 
 
 # The fit.
-
-
 class HarmonicsByAnotherName(SphericalHarmonics):
     """A head that is harmonics without saying so."""
 
@@ -242,8 +238,6 @@ def test_the_fine_tune_leaves_alone_what_is_right(tiny_scene, tmp_path):
 
 
 # The commands.
-
-
 @pytest.mark.parametrize("method", METHODS)
 def test_the_command_writes_the_splats_and_says_what_was_lost(method, trained, tmp_path):
     config, ours, report = trained(method), tmp_path / "ours.ply", tmp_path / "deep" / "report.json"
@@ -363,8 +357,6 @@ def test_mistakes_are_told_in_a_sentence(trained, tmp_path):
 
 
 # The page.
-
-
 def test_a_page_holds_the_scene_and_the_photographs(trained, tmp_path):
     report = tmp_path / "report.json"
     web = WebOptions(author="me")

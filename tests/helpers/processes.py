@@ -40,8 +40,6 @@ def open3d_shown() -> Iterator[None]:
 
 
 # A quick start of each training in a process of tests.
-
-
 FREEZE, UNFREEZE = gc.freeze, gc.unfreeze
 
 

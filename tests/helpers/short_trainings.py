@@ -108,16 +108,10 @@ def tensors_of(tree: Any, prefix: str = "") -> dict[str, torch.Tensor]:
 
 # What trainings of 300 steps reach, from which bounds follow. results/smoke.json has, for each case, the PSNR of
 # trainings with several seeds, and that after one step.
-
-
 SMOKE_FILE = Path(__file__).resolve().parents[2] / "results" / "smoke.json"
 SMOKE_METHODS = "nrfgs", "nrfgs-sh", "nrfgs-vdgs", "nrfgs-gsnb", "nrfgs-sg"
 SMOKE_STEPS = 300
-PLAIN = {
-    "--pipeline.model.num-downscales": 0,
-    "--pipeline.model.few-views": "off",
-    "--pipeline.model.shrinkage": 0,
-}
+PLAIN = {"--pipeline.model.num-downscales": 0, "--pipeline.model.few-views": "off", "--pipeline.model.shrinkage": 0}
 
 
 @cache

@@ -81,8 +81,6 @@ def test_not_a_number_is_seen():
 
 
 # The kernels on a CUDA device. `pytest -m gpu`.
-
-
 @pytest.fixture
 def kernels_run():
     assert module.kernels_run_on(torch.device("cuda", torch.cuda.current_device()))

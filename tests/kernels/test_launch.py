@@ -91,8 +91,6 @@ def test_the_interpreter_and_old_tritons_are_asked_each_time(monkeypatch, old):
 
 
 # All kernels in Triton's interpreter (`*_interpreted.py` beside what they test), in one process of their own.
-
-
 TESTS = Path(__file__).parents[1]
 
 

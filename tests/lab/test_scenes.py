@@ -120,7 +120,6 @@ def test_view_dependence_grows_with_gloss():
 
 
 # The data set.
-
 MATT = SceneConfig(gloss=0.0, views=10, width=96, height=72, points=1500, samples=1)
 GLOSSY = SceneConfig(gloss=1.0, views=9, width=24, height=18, points=50)
 

@@ -265,8 +265,6 @@ def test_training_starts_with_one_warm_up_step_per_view_or_as_many_as_asked(buil
 
 
 # Where an image comes from: composited colours, or a head at the pixel that turns composited features into one.
-
-
 BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
 
 

@@ -35,7 +35,6 @@ def three(tmp_path) -> Path:
 
 
 # Two textured walls, one before the other, seen by cameras that step sideways and turn a little.
-
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
 
 
@@ -124,8 +123,6 @@ def check_walk(poses: np.ndarray) -> None:
 
 
 # The whole way, in small.
-
-
 def test_recovered_cameras_are_those_that_rendered(prepared):
     meta, poses = frames_of(prepared)
     for i, frame in enumerate(meta["frames"]):
@@ -220,8 +217,6 @@ def test_interrupted_features_are_taken_up(walls, tmp_path, monkeypatch):
 
 
 # Advice where it fails.
-
-
 def test_photographs_that_show_nothing_in_common_are_told(tmp_path):
     for i in range(3):
         photo(tmp_path / "photos" / f"{i}.png", (120, 90), ("red", "green", "blue")[i])
@@ -332,8 +327,6 @@ def test_what_colmap_could_not_write_whole_is_not_built_on(prepared, tmp_path, m
 
 
 # Collecting.
-
-
 def test_photographs_are_kept_or_made_upright(tmp_path):
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation], exif[ExifTags.Base.Model] = 6, "Camera"
@@ -432,8 +425,6 @@ def test_the_sharpest_frame_of_each_piece_of_a_video_is_taken(tmp_path):
 
 
 # The whole way, on real photographs.
-
-
 @pytest.mark.slow
 def test_a_real_capture_is_recovered(captures, tmp_path):
     """Every second photograph of `fox` at two thirds of its size, against the poses that the capture came with."""

@@ -91,8 +91,6 @@ def test_blocks_without_a_pair(monkeypatch):
 
 
 # Projection: extreme gradients, and the order of rows.
-
-
 W, H = 40, 28
 ANTIALIASED = ProjectionOptions("antialiased")
 
@@ -136,8 +134,6 @@ def test_rows_are_ordered_by_camera_then_splat():
 
 
 # On a GPU: gsplat's images and gradients from the lists. In Triton's interpreter: tile_lists_interpreted.py.
-
-
 @pytest.mark.gpu
 class TestOnCuda:
     def test_tiles_list_what_draws_in_them(self):

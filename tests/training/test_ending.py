@@ -265,8 +265,6 @@ def test_what_ns_train_says_before_it_begins(tiny_scene, tmp_path, monkeypatch, 
 
 
 # Signals and states, without a training.
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_is_a_request_and_handlers_are_given_back(number, capfd):
     request, before = StopRequest(), signal.getsignal(number)

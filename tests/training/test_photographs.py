@@ -66,8 +66,6 @@ def test_exposure_in_stops_of_exif_from_the_data_set_or_else_from_the_file(tmp_p
 
 
 # Trainings.
-
-
 def linear(values):
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 

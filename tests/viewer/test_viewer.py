@@ -206,8 +206,6 @@ def test_depth_is_dark_near_and_bright_far():
 
 
 # In nerfstudio's viewer.
-
-
 class Browser(RenderStateMachine):
     """One of the viewer's render threads, which renders one image as it would for a browser, and ends."""
 
@@ -384,8 +382,6 @@ def test_an_interrupted_rendering_leaves_no_lock_behind(build, open_viewer):
 
 
 # The viewer opens without reading anything twice, and shows what it showed.
-
-
 def test_a_training_s_photographs_are_not_read_again(pipeline, tiny_scene, tmp_path, monkeypatch):
     dataset, reads, shown = pipeline.datamanager.train_dataset, [], []
     get_data, threads = NrfgsInputDataset.get_data, torch.get_num_threads()

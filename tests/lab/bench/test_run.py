@@ -76,8 +76,6 @@ def test_checkpoints_of_other_arguments_are_cleared(tmp_path):
 
 
 # A real run, in this process.
-
-
 class Killed(BaseException):
     """Stands for a signal."""
 

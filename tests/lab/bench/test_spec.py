@@ -31,8 +31,6 @@ def spec(**more):
 
 
 # The file.
-
-
 def plans() -> dict[tuple[str, str], Spec]:
     """Each plan of the shipped files, by file and name."""
     result = {}
@@ -106,14 +104,8 @@ def test_a_preset_keeps_its_steps():
 
 
 # Commands.
-
-
 @pytest.mark.parametrize(
-    "strategy, densification",
-    [
-        ("own", ErrorGuided()),
-        ("mcmc@77,refine_every=9", Mcmc(budget=77, refine_every=9)),
-    ],
+    "strategy, densification", [("own", ErrorGuided()), ("mcmc@77,refine_every=9", Mcmc(budget=77, refine_every=9))]
 )
 def test_the_command_means_what_the_file_says(strategy, densification, tiny_scene, tmp_path):
     runs = {"NRF": {"method": "nrfgs", "options": "--pipeline.model.appearance.latent-dim 9"}}
@@ -145,8 +137,6 @@ def test_fingerprints_ignore_paths_and_see_the_rest():
 
 
 # Data sets.
-
-
 def load(parser: list[str], method: str = "nrfgs"):
     """The data manager that ns-train would have, with all its images."""
     data = parse([method, *parser]).pipeline.datamanager.setup(device="cpu", test_mode="val")
