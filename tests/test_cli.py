@@ -40,18 +40,15 @@ def test_the_list_has_every_command_and_its_first_sentence(tmp_path):
         assert name in run.stdout and summary(entry) and summary(entry) in run.stdout
 
 
-@pytest.mark.parametrize(
-    "words, says",
-    [
-        (["exprot"], "no command 'exprot'. Did you mean `nrfgs export`?"),
-        (["xyz"], "There are bench, demo, doctor, eval"),
-        (["eval"], "no folder outputs here"),
-        (["view", "."], "no config.yml in this folder or below"),
-        (["prepare", "nowhere", "out"], "no such folder or video"),
-        (["export", "ply", "--load-config", "nowhere", "--output", "x.ply"], "nowhere: no such file or folder"),
-        (["export", "web", "nowhere", "--output", "x.html"], "nowhere: no such file or folder"),
-    ],
-)
+@pytest.mark.parametrize("words, says", [
+    (["exprot"], "no command 'exprot'. Did you mean `nrfgs export`?"),
+    (["xyz"], "There are bench, demo, doctor, eval"),
+    (["eval"], "no folder outputs here"),
+    (["view", "."], "no config.yml in this folder or below"),
+    (["prepare", "nowhere", "out"], "no such folder or video"),
+    (["export", "ply", "--load-config", "nowhere", "--output", "x.ply"], "nowhere: no such file or folder"),
+    (["export", "web", "nowhere", "--output", "x.html"], "nowhere: no such file or folder"),
+])  # fmt: skip
 def test_mistakes_are_told_before_torch_is_imported(words, says, tmp_path):
     run = nrfgs(*words, folder=tmp_path)
     assert run.returncode != 0 and says in " ".join(run.stderr.split()) and not list(tmp_path.iterdir())

@@ -103,20 +103,17 @@ def test_everything_else_is_splatfactos(name):
         assert getattr(datamanager, field) == getattr(host_datamanager, field), field
 
 
-@pytest.mark.parametrize(
-    "name, differs",
-    [
-        ("nrfgs-fast", {"max_num_iterations": 10_000, "schedule_steps": 30_000, "average_steps": 200}),
-        (
-            "nrfgs-best",
-            {
-                "max_num_iterations": 30_000,
-                "average_steps": 200,
-                "pipeline.model.densification": "error-guided,threshold=0.0016",
-            },
-        ),
-    ],
-)
+@pytest.mark.parametrize("name, differs", [
+    ("nrfgs-fast", {"max_num_iterations": 10_000, "schedule_steps": 30_000, "average_steps": 200}),
+    (
+        "nrfgs-best",
+        {
+            "max_num_iterations": 30_000,
+            "average_steps": 200,
+            "pipeline.model.densification": "error-guided,threshold=0.0016",
+        },
+    ),
+])  # fmt: skip
 def test_a_preset_differs_in_what_it_says_and_shares_nothing(name, differs):
     ours, base = dict(leaves(PRESETS[name].config)), dict(leaves(menu.nrfgs.config))
     assert ours.keys() == base.keys()

@@ -22,16 +22,13 @@ def interpolate(grid, x):
     return Interpolation.apply(x, grid.table, grid.resolutions, len(grid.sides), grid.table_size)
 
 
-@pytest.mark.parametrize(
-    "count, options, numbered",
-    [
-        (0, {"levels": 1}, 1),
-        (65, {"levels": 1}, 1),  # one more than a block
-        (60, {}, 2),
-        (30, {"levels": 2, "log2_table_size": 1}, 0),
-        (30, {"levels": 4, "log2_table_size": 15, "base_resolution": 16}, 1),  # the paper's: 16, 24, 36, 54
-    ],
-)
+@pytest.mark.parametrize("count, options, numbered", [
+    (0, {"levels": 1}, 1),
+    (65, {"levels": 1}, 1),  # one more than a block
+    (60, {}, 2),
+    (30, {"levels": 2, "log2_table_size": 1}, 0),
+    (30, {"levels": 4, "log2_table_size": 15, "base_resolution": 16}, 1),  # the paper's: 16, 24, 36, 54
+])  # fmt: skip
 def test_hash_grid_values_and_gradients(count, options, numbered):
     grid, twin = grids(**options)
     assert len(grid.sides) == numbered

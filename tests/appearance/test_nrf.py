@@ -109,17 +109,14 @@ def test_cpu_takes_torch(monkeypatch):
     assert not head.fused.takes(splats)
 
 
-@pytest.mark.parametrize(
-    "interpreted, dtype, sizes, reason",
-    [
-        ("0", torch.float32, {}, "the splats are on cpu"),
-        ("1", torch.float64, {}, "the splats are not float32"),
-        *(
-            ("1", torch.float32, sizes, "its sizes are beyond the kernels'")
-            for sizes in ({"latent_dim": 65}, {"hidden_width": 129}, {"hidden_width": 65, "num_bands": 5})
-        ),
-    ],
-)
+@pytest.mark.parametrize("interpreted, dtype, sizes, reason", [
+    ("0", torch.float32, {}, "the splats are on cpu"),
+    ("1", torch.float64, {}, "the splats are not float32"),
+    *(
+        ("1", torch.float32, sizes, "its sizes are beyond the kernels'")
+        for sizes in ({"latent_dim": 65}, {"hidden_width": 129}, {"hidden_width": 65, "num_bands": 5})
+    ),
+])  # fmt: skip
 def test_demanding_the_impossible_names_the_reason(interpreted, dtype, sizes, reason, monkeypatch):
     monkeypatch.setenv("TRITON_INTERPRET", interpreted)
     head, _ = heads(**sizes)

@@ -66,15 +66,12 @@ def assert_healthy(head, splats, center, rows=None):
 
 
 @pytest.mark.parametrize("head", HEADS)
-@pytest.mark.parametrize(
-    "extreme",
-    [
-        *(Extreme(distance=10.0**exponent, coordinate=0.0) for exponent in (-30, -20, -12, -3, 3, 12, 19, 30)),
-        *(Extreme(coordinate=at, distance=distance) for at in (1e-6, 1e6) for distance in (1e-6, 1.0, 1e6)),
-        *(Extreme(latent=size) for size in (1e4, 1e10, 1e20)),
-        *(Extreme(color=color) for color in (-1e18, 1e4, 1e18)),
-    ],
-)
+@pytest.mark.parametrize("extreme", [
+    *(Extreme(distance=10.0**exponent, coordinate=0.0) for exponent in (-30, -20, -12, -3, 3, 12, 19, 30)),
+    *(Extreme(coordinate=at, distance=distance) for at in (1e-6, 1e6) for distance in (1e-6, 1.0, 1e6)),
+    *(Extreme(latent=size) for size in (1e4, 1e10, 1e20)),
+    *(Extreme(color=color) for color in (-1e18, 1e4, 1e18)),
+])  # fmt: skip
 def test_coordinates_latents_and_base_colours(head, extreme):
     """At 1e6, float32 sees positions on a grid of 1/16: splats closer than that are on the camera, and no harm done."""
     assert_healthy(*build(head, extreme))

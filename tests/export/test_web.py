@@ -51,15 +51,12 @@ def test_a_page_needs_nothing_but_itself_or_names_its_scene():
     assert Elements(text).scripts["packed"] == "scene.nrf" and "connect-src 'self'" in text
 
 
-@pytest.mark.parametrize(
-    "options, vectors",
-    [
-        ({}, 16 * (10 + 4) + 1 + 16 * (13 + 4) + 1),
-        ({"hidden_width": 30, "num_bands": 2, "use_distance": False}, 8 * (9 + 4) + 1 + 8 * (6 + 4) + 1),
-        ({"split_bands": False}, 32 * (22 + 4) + 1),
-        ({"num_bands": 1}, 16 * (10 + 4) + 1),
-    ],
-)
+@pytest.mark.parametrize("options, vectors", [
+    ({}, 16 * (10 + 4) + 1 + 16 * (13 + 4) + 1),
+    ({"hidden_width": 30, "num_bands": 2, "use_distance": False}, 8 * (9 + 4) + 1 + 8 * (6 + 4) + 1),
+    ({"split_bands": False}, 32 * (22 + 4) + 1),
+    ({"num_bands": 1}, 16 * (10 + 4) + 1),
+])  # fmt: skip
 def test_how_many_weights_a_view_needs(options, vectors):
     assert weight_vectors(NrfConfig(**options).setup()) == vectors
 

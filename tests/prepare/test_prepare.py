@@ -237,17 +237,14 @@ def test_global_mapping_helps_out_and_finds_the_same(prepared, walls, tmp_path, 
     check_walk(frames_of(out)[1])
 
 
-@pytest.mark.parametrize(
-    ("make", "said"),
-    [
-        (lambda d: None, "no such folder"),
-        (lambda d: photo(d / "more" / "a.jpg"), "directly holds 0 photographs"),
-        (lambda d: (d.mkdir(), (d / "a.mp4").touch()), "name that file itself"),
-        (lambda d: [photo(d / "a.jpg"), (d / "b.HEIC").touch()], "b.HEIC is .*: run `pip install pillow-heif`"),
-        (lambda d: (photo(d / "images" / "a.jpg"), (d / "transforms.json").touch()), "scene already.*ns-train nrfgs"),
-        (lambda d: d.write_text("no video"), "neither a folder of photographs nor a video"),
-    ],
-)
+@pytest.mark.parametrize(("make", "said"), [
+    (lambda d: None, "no such folder"),
+    (lambda d: photo(d / "more" / "a.jpg"), "directly holds 0 photographs"),
+    (lambda d: (d.mkdir(), (d / "a.mp4").touch()), "name that file itself"),
+    (lambda d: [photo(d / "a.jpg"), (d / "b.HEIC").touch()], "b.HEIC is .*: run `pip install pillow-heif`"),
+    (lambda d: (photo(d / "images" / "a.jpg"), (d / "transforms.json").touch()), "scene already.*ns-train nrfgs"),
+    (lambda d: d.write_text("no video"), "neither a folder of photographs nor a video"),
+])  # fmt: skip
 def test_inputs_that_cannot_do_are_refused(make, said, tmp_path, no_heif):
     make(tmp_path / "in")
     with pytest.raises(InputError, match=said):
@@ -286,14 +283,11 @@ def test_what_is_refused_before_any_work(three, tmp_path, monkeypatch):
         Run(Prepare(three, tmp_path / "out"))
 
 
-@pytest.mark.parametrize(
-    ("file", "content", "said"),
-    [
-        ("state.json", "[1, 2]", "state.json is damaged"),
-        ("state.json", "{", "state.json is damaged"),
-        ("database.db", "no database", "COLMAP stops with"),
-    ],
-)
+@pytest.mark.parametrize(("file", "content", "said"), [
+    ("state.json", "[1, 2]", "state.json is damaged"),
+    ("state.json", "{", "state.json is damaged"),
+    ("database.db", "no database", "COLMAP stops with"),
+])  # fmt: skip
 def test_damaged_work_is_told_in_one_sentence(prepared, walls, tmp_path, file, content, said):
     out = tmp_path / "scene"
     shutil.copytree(prepared, out)
@@ -391,15 +385,12 @@ def test_names_stay_different_and_one_camera_needs_all_to_agree_with_damaged_exi
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 50 50\nshowpage\n"
 
 
-@pytest.mark.parametrize(
-    ("make", "said"),
-    [
-        (lambda path: path.write_bytes(EPS), "not a readable image"),
-        (lambda path: Image.new("RGB", (1, 3000)).save(path), "1 x 3000 pixels"),
-        (lambda path: Image.new("I;16", (40, 30)).save(path), "more than 8 bits"),
-        (lambda path: path.write_bytes(path.read_bytes()[:-40]), "cannot be decoded"),
-    ],
-)
+@pytest.mark.parametrize(("make", "said"), [
+    (lambda path: path.write_bytes(EPS), "not a readable image"),
+    (lambda path: Image.new("RGB", (1, 3000)).save(path), "1 x 3000 pixels"),
+    (lambda path: Image.new("I;16", (40, 30)).save(path), "more than 8 bits"),
+    (lambda path: path.write_bytes(path.read_bytes()[:-40]), "cannot be decoded"),
+])  # fmt: skip
 def test_what_is_no_photograph_is_named(three, tmp_path, make, said):
     make(three / "1.png")
     with pytest.raises(InputError, match=f"1.png.*{said}"):

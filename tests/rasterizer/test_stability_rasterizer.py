@@ -82,14 +82,11 @@ def test_log_scales_from_minus_40_to_plus_20(device, mode, exponent, shape, dept
 
 @devices
 @modes
-@pytest.mark.parametrize(
-    "planted",
-    [
-        *({"means": [x, 0.0, 2.0], "scales": [s] * 3} for x in (1e6, -1e6, 1e18, -3e38) for s in (0.1, 1e6, 1e18)),
-        *({"opacities": opacity} for opacity in (-1.0, 0.0, 1e-30, 1 / 255, 0.999, 1.0, 1.5)),
-        *({"colors": [color] * 3} for color in (1e4, 1e15)),  # gradients as large are below the guard's limit of 2^63
-    ],
-)
+@pytest.mark.parametrize("planted", [
+    *({"means": [x, 0.0, 2.0], "scales": [s] * 3} for x in (1e6, -1e6, 1e18, -3e38) for s in (0.1, 1e6, 1e18)),
+    *({"opacities": opacity} for opacity in (-1.0, 0.0, 1e-30, 1 / 255, 0.999, 1.0, 1.5)),
+    *({"colors": [color] * 3} for color in (1e4, 1e15)),  # gradients as large are below the guard's limit of 2^63
+])  # fmt: skip
 def test_far_to_the_side_of_any_opacity_and_of_large_colours(device, mode, planted):
     image, _, _ = assert_healthy(cloud(device, **planted), rasterize_mode=mode)
     assert image.max() <= max(4.0, 1.001 * planted.get("colors", [0])[0])

@@ -160,35 +160,29 @@ def scene(names=("a.png", "b.png", "c.png"), shift: float = 0.0) -> dict:
     return scene_of(list(names), SimpleNamespace(camera_to_worlds=poses))
 
 
-@pytest.mark.parametrize(
-    ("here", "message"),
-    [
-        (scene(("a.png", "x.png", "c.png")), r"other images \(b.png, x.png\)"),
-        (scene(("a.png", "b.png")), r"other images \(c.png\)"),
-        (scene(shift=0.1), r"other poses \(b.png elsewhere\)"),
-    ],
-)
+@pytest.mark.parametrize(("here", "message"), [
+    (scene(("a.png", "x.png", "c.png")), r"other images \(b.png, x.png\)"),
+    (scene(("a.png", "b.png")), r"other images \(c.png\)"),
+    (scene(shift=0.1), r"other poses \(b.png elsewhere\)"),
+])  # fmt: skip
 def test_another_scene_is_refused(here, message):
     check_scene(scene(), scene(shift=1e-4), "elsewhere")
     with pytest.raises(InputError, match=message):
         check_scene(scene(), here, "data/fox")
 
 
-@pytest.mark.parametrize(
-    "name, value, may_change",
-    [
-        ("pipeline.model.appearance.num_bands", 2, False),
-        ("pipeline.model.rasterize_mode", "antialiased", False),
-        ("pipeline.datamanager.dataparser.scale_factor", 2.0, False),
-        ("pipeline.datamanager.camera_res_scale_factor", 0.5, False),
-        ("optimizers.means.optimizer.lr", 1e-5, True),
-        ("max_num_iterations", 600, True),
-        ("pipeline.model.densification.refine_every", 50, True),
-        ("pipeline.datamanager.cache_images", "cpu", True),
-        ("pipeline.model.appearance.implementation", "torch", True),
-        ("pipeline.datamanager.dataparser.data", "elsewhere", True),
-    ],
-)
+@pytest.mark.parametrize("name, value, may_change", [
+    ("pipeline.model.appearance.num_bands", 2, False),
+    ("pipeline.model.rasterize_mode", "antialiased", False),
+    ("pipeline.datamanager.dataparser.scale_factor", 2.0, False),
+    ("pipeline.datamanager.camera_res_scale_factor", 0.5, False),
+    ("optimizers.means.optimizer.lr", 1e-5, True),
+    ("max_num_iterations", 600, True),
+    ("pipeline.model.densification.refine_every", 50, True),
+    ("pipeline.datamanager.cache_images", "cpu", True),
+    ("pipeline.model.appearance.implementation", "torch", True),
+    ("pipeline.datamanager.dataparser.data", "elsewhere", True),
+])  # fmt: skip
 def test_an_option_that_changes_the_meaning_is_refused(name, value, may_change):
     says = pytest.raises(InputError, match="--" + name.replace("_", "-") + " was .* and is ")
     with contextlib.nullcontext() if may_change else says:

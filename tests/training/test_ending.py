@@ -184,29 +184,26 @@ def test_a_finished_training_says_so_and_how_to_extend_it(finished, tiny_scene, 
     assert max(find(longer.checkpoint_dir)) == STEPS + 1
 
 
-@pytest.mark.parametrize(
-    ("option", "bad"),
-    [
-        ("max_num_iterations", -1),
-        ("pipeline.model.view_noise", math.inf),
-        ("pipeline.model.ssim_lambda", math.nan),
-        ("pipeline.model.resolution_schedule", 0),
-        ("pipeline.model.robust_loss", 2.0),
-        ("pipeline.datamanager.camera_res_scale_factor", 0),
-        ("logging.steps_per_log", 0),
-        ("load_step", 5),
-        ("time_budget", 0),
-        ("time_budget", math.nan),
-        ("schedule_steps", -5),
-        ("machine.num_devices", 0),
-        ("optimizers.quats.optimizer.lr", -1.0),
-        ("optimizers.means.optimizer.lr", 0.0),
-        ("optimizers.quats.optimizer.lr", 1e30),
-        ("optimizers.means.scheduler.lr_final", 0.0),
-        ("mixed_precision", True),
-        ("gradient_accumulation_steps", {"means": 2}),
-    ],
-)
+@pytest.mark.parametrize(("option", "bad"), [
+    ("max_num_iterations", -1),
+    ("pipeline.model.view_noise", math.inf),
+    ("pipeline.model.ssim_lambda", math.nan),
+    ("pipeline.model.resolution_schedule", 0),
+    ("pipeline.model.robust_loss", 2.0),
+    ("pipeline.datamanager.camera_res_scale_factor", 0),
+    ("logging.steps_per_log", 0),
+    ("load_step", 5),
+    ("time_budget", 0),
+    ("time_budget", math.nan),
+    ("schedule_steps", -5),
+    ("machine.num_devices", 0),
+    ("optimizers.quats.optimizer.lr", -1.0),
+    ("optimizers.means.optimizer.lr", 0.0),
+    ("optimizers.quats.optimizer.lr", 1e30),
+    ("optimizers.means.scheduler.lr_final", 0.0),
+    ("mixed_precision", True),
+    ("gradient_accumulation_steps", {"means": 2}),
+])  # fmt: skip
 def test_options_without_sense_are_refused(option, bad, tiny_scene):
     config = replace(config_with(option, bad), data=tiny_scene)
     with pytest.raises(InputError, match=re.escape(f"{option} is {bad}")):

@@ -142,15 +142,12 @@ def test_learning_rates_of_the_command_count_where_a_training_goes_on(finished, 
     assert groups["quats"]["eps"] == 1e-9
 
 
-@pytest.mark.parametrize(
-    "method, more, says",
-    [
-        ("nrfgs-sh", {}, "written by the 'nrf' head"),
-        ("nrfgs", {"--pipeline.model.appearance.latent-dim": 8}, "latents"),
-        ("nrfgs", {"--pipeline.model.appearance.hidden-width": 32}, "head.low"),
-        ("nrfgs", {"--pipeline.model.appearance.split-bands": False}, "head."),
-    ],
-)
+@pytest.mark.parametrize("method, more, says", [
+    ("nrfgs-sh", {}, "written by the 'nrf' head"),
+    ("nrfgs", {"--pipeline.model.appearance.latent-dim": 8}, "latents"),
+    ("nrfgs", {"--pipeline.model.appearance.hidden-width": 32}, "head.low"),
+    ("nrfgs", {"--pipeline.model.appearance.split-bands": False}, "head."),
+])  # fmt: skip
 def test_checkpoint_of_another_head_is_refused(method, more, says, finished, tiny_scene, tmp_path):
     args = options(tiny_scene, tmp_path, method, {"--load-dir": models_of(finished("nrfgs"))}, more)
     with pytest.raises(InputError, match=says) as error:

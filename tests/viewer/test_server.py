@@ -88,31 +88,25 @@ def test_the_network_is_refused_unless_it_is_asked_for(open_viewer, pipeline, in
     assert "127.0.0.1" in viewer.viewer_info[0] and f"ssh -L {port}:localhost:{port}" in viewer.viewer_info[-1]
 
 
-@pytest.mark.parametrize(
-    "options, says",
-    [
-        ({"websocket_port": 65536}, "port is 65536"),
-        ({"websocket_host": "192.0.2.1"}, "cannot listen on '192.0.2.1'"),  # of no machine (RFC 5737)
-        ({"websocket_host": "." * 70}, "cannot listen on"),
-    ],
-)
+@pytest.mark.parametrize("options, says", [
+    ({"websocket_port": 65536}, "port is 65536"),
+    ({"websocket_host": "192.0.2.1"}, "cannot listen on '192.0.2.1'"),  # of no machine (RFC 5737)
+    ({"websocket_host": "." * 70}, "cannot listen on"),
+])  # fmt: skip
 def test_where_nothing_can_listen_is_told(open_viewer, pipeline, options, says):
     with pytest.raises(InputError, match=says):
         open_viewer(pipeline, LocalViewerConfig(**options))
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
-        "/../../../../../../../../../../etc/passwd",
-        "/%2e%2e/%2e%2e/%2e%2e/%2e%2e/%2e%2e/%2e%2e/etc/passwd",
-        "/../__init__.py",
-        "/assets",
-        "/a\0b",
-        "/" + "a" * 5000,
-        "http://elsewhere/index.html",
-    ],
-)
+@pytest.mark.parametrize("path", [
+    "/../../../../../../../../../../etc/passwd",
+    "/%2e%2e/%2e%2e/%2e%2e/%2e%2e/%2e%2e/%2e%2e/etc/passwd",
+    "/../__init__.py",
+    "/assets",
+    "/a\0b",
+    "/" + "a" * 5000,
+    "http://elsewhere/index.html",
+])  # fmt: skip
 def test_no_file_outside_the_page_is_served(to_all, interface, path):
     status, body = answer(interface, to_all.viser_server.get_port(), path)
     assert status == 404 and body == b"404"

@@ -61,25 +61,22 @@ def test_which_trainings_a_plan_has():
     assert "--max-num-iterations" not in command(plan, cells[1], [], Path())
 
 
-@pytest.mark.parametrize(
-    "content, says",
-    [
-        ({"runs": {"NRF": {"options": "-x"}}}, "NRF names no method"),
-        ({"runs": {"NRF": {"method": "nrfgs", "colour": 3}}}, "NRF: unknown key.*colour"),
-        ({"strategies": ["mcmc@many"]}, "budget is 'many'"),
-        ({"seeds": ["x"]}, "seeds"),
-        ({"scenes": ["a b", "a_b"]}, "twice"),
-        ({"runs": {"host": {"method": "splatfacto", "strategies": ["original"]}}}, "splatfacto knows no strategy"),
-        ({"runs": {"N": {"method": "nrfgs", "options": "--max-num-iterations 9"}}}, "N: options: --max-num.*use steps"),
-        ({"options": "--machine.seed=3"}, "options: --machine.seed is given by the benchmark; use seeds"),
-        ({"strategies": []}, "strategies or seeds is empty"),
-        ({"scenes": ["../bonsai"]}, "no folder below --scenes"),
-        (
-            {"strategies": ["mcmc"], "options": "--pipeline.model.densification original"},
-            "densification is given.*mcmc",
-        ),
-    ],
-)
+@pytest.mark.parametrize("content, says", [
+    ({"runs": {"NRF": {"options": "-x"}}}, "NRF names no method"),
+    ({"runs": {"NRF": {"method": "nrfgs", "colour": 3}}}, "NRF: unknown key.*colour"),
+    ({"strategies": ["mcmc@many"]}, "budget is 'many'"),
+    ({"seeds": ["x"]}, "seeds"),
+    ({"scenes": ["a b", "a_b"]}, "twice"),
+    ({"runs": {"host": {"method": "splatfacto", "strategies": ["original"]}}}, "splatfacto knows no strategy"),
+    ({"runs": {"N": {"method": "nrfgs", "options": "--max-num-iterations 9"}}}, "N: options: --max-num.*use steps"),
+    ({"options": "--machine.seed=3"}, "options: --machine.seed is given by the benchmark; use seeds"),
+    ({"strategies": []}, "strategies or seeds is empty"),
+    ({"scenes": ["../bonsai"]}, "no folder below --scenes"),
+    (
+        {"strategies": ["mcmc"], "options": "--pipeline.model.densification original"},
+        "densification is given.*mcmc",
+    ),
+])  # fmt: skip
 def test_what_is_wrong_is_named(content, says):
     with pytest.raises(InputError, match=says):
         spec(**content)
