@@ -69,13 +69,9 @@ def test_every_file_of_the_packages_is_in_it_and_entry_points_name_some(wheel):
     text = wheel.read(next(name for name in wheel.namelist() if name.endswith("/entry_points.txt"))).decode()
     targets = [line.split(" = ")[1] for line in text.splitlines() if " = " in line]
     for module, _, name in (target.partition(":") for target in targets):
-        source = next(wheel.read(file) for file in candidates(module) if file in wheel.namelist())
+        path = module.replace(".", "/")
+        source = next(wheel.read(f) for f in (f"{path}.py", f"{path}/__init__.py") if f in wheel.namelist())
         assert not name or re.search(rf"^(class |def )?{name}\b", source.decode(), re.MULTILINE), (module, name)
-
-
-def candidates(module: str) -> tuple[str, str]:
-    path = module.replace(".", "/")
-    return f"{path}.py", f"{path}/__init__.py"
 
 
 def test_metadata_is_complete(about):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loss of L1 and SSIM: PyTorch's path against pytorch_msssim. Its kernels: ssim_interpreted.py."""
+"""The loss of L1 and SSIM: PyTorch's path against pytorch_msssim. Its kernels: kernels/small_interpreted.py."""
 
 import pytest
 import torch

@@ -133,7 +133,7 @@ def test_rows_are_ordered_by_camera_then_splat():
     assert p.camera_ids.dtype == p.gaussian_ids.dtype == torch.int64 and p.radii.dtype == torch.int32
 
 
-# On a GPU: gsplat's images and gradients from the lists. In Triton's interpreter: tile_lists_interpreted.py.
+# On a GPU: gsplat's images and gradients from the lists. In Triton's interpreter: kernels/small_interpreted.py.
 @pytest.mark.gpu
 class TestOnCuda:
     def test_tiles_list_what_draws_in_them(self):

@@ -32,18 +32,9 @@ from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.model.renderer import View
+from nrfgs_ns.viewer import pictures as drawn
 from nrfgs_ns.viewer import start
-from nrfgs_ns.viewer.pictures import (
-    BASE,
-    DEPTH,
-    FULL,
-    VIEW_DEPENDENCE,
-    PictureOptions,
-    legends,
-    picture,
-    scaled_depth,
-    view_dependence,
-)
+from nrfgs_ns.viewer.pictures import BASE, DEPTH, FULL, VIEW_DEPENDENCE, PictureOptions, legends, picture
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -189,20 +180,20 @@ def test_view_dependence_is_the_deviation_over_the_sphere():
     splats = {"means": means, "opacities": torch.zeros(5, 1), **head.splat_params(torch.full((5, 3), 0.5))}
     visible, center = torch.tensor([0, 2, 3]), torch.tensor([4.0, 0.0, 1.0])
     field, view = Field(head, splats), View(SimpleNamespace(gaussian_ids=visible), center)
-    assert view_dependence(field, view).abs().max() == 0
+    assert drawn.view_dependence(field, view).abs().max() == 0
     splats["features_rest"][2, :, 1] = torch.tensor([0.3, -0.2, 0.1])
     # sqrt(k . k / (4 pi)) in one channel; a third of its square over three channels.
     expected = torch.tensor([0.0, (0.14 / (12 * torch.pi)) ** 0.5, 0.0])[:, None]
     # 12 colours near 1/2 are rounded at 2^-25 each.
-    assert_close(view_dependence(field, view), expected, rtol=0, atol=12 * 2**-25)
+    assert_close(drawn.view_dependence(field, view), expected, rtol=0, atol=12 * 2**-25)
 
 
 def test_depth_is_dark_near_and_bright_far():
     depth = torch.tensor([[1.0, 2.0, 3.0, 50.0]])[..., None]
     opaque = torch.tensor([[1.0, 1.0, 1.0, 0.1]])[..., None]
     # The quantile of three is the second; what is hardly there does not count.
-    assert scaled_depth(depth, opaque).flatten().tolist() == [0.0, 1.0, 1.0, 1.0]
-    assert scaled_depth(depth, 0 * opaque).abs().max() == 0
+    assert drawn.scaled_depth(depth, opaque).flatten().tolist() == [0.0, 1.0, 1.0, 1.0]
+    assert drawn.scaled_depth(depth, 0 * opaque).abs().max() == 0
 
 
 # In nerfstudio's viewer.
