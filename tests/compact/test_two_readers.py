@@ -21,7 +21,9 @@ import compact_fields
 import numpy as np
 import pytest
 import torch
-from compact_fields import RENDER, field, in_node
+from compact_fields import RENDER, field, in_node, read_container
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.field import Field
@@ -29,7 +31,7 @@ from nrfgs_ns.appearance.head import base_colors
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.compact.decode import Decoded, decode
 from nrfgs_ns.compact.encode import encode
-from nrfgs_ns.compact.format import MODEL, PREAMBLE, Table, _pack, _unpack, container
+from nrfgs_ns.compact.format import BROKEN, MODEL, PREAMBLE, Table, _pack, _unpack, container
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.trained.loading import load_file
 
@@ -395,6 +397,15 @@ def agree(cases: dict[str, bytes], found: list[dict], folder: Path) -> None:
 def test_both_readers_refuse_the_same_files(cases, tmp_path):
     (tmp_path / "cases.json").write_text(json.dumps([base64.b64encode(data).decode() for data in cases.values()]))
     agree(cases, in_node(READ, tmp_path), tmp_path)
+
+
+@settings(max_examples=150)
+@given(st.integers(0, 10**6), st.integers(1, 255))
+def test_a_changed_byte_is_noticed(at, by):
+    """CRC-32 finds every change of one byte; the length finds the file's own."""
+    data = written()
+    with pytest.raises(BROKEN):
+        read_container(flipped(at % len(data), by)(data))
 
 
 def test_what_is_read_can_be_shown(tmp_path):

@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What devices do in the tests: `python device.py JOB WORLD SCENE FOLDER DEVICE_TYPE`.
-
-JOB is a function of `jobs.py`, run by a process for each of WORLD devices. Results are saved in FOLDER for the tests to
-look at.
-"""
+"""`python device.py JOB WORLD SCENE FOLDER DEVICE_TYPE` runs a function of `jobs.py` in a process for each of WORLD
+devices, which save their results in FOLDER for the tests to look at."""
 
 import sys
 from pathlib import Path

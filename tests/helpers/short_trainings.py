@@ -89,10 +89,8 @@ def checkpoint_of(config: Path) -> dict:
 
 def assert_same_training(one: dict, other: dict, rtol: float = 1e-5, atol: float = 1e-7) -> None:
     """Assert that two checkpoints have the same step and tensors: parameters, densification's counts, Adam's moments.
-
     A training that goes on from its checkpoint is the unbroken one: on the same machine both add the same numbers in
-    the same order, so that only a lost state can differ.
-    """
+    the same order, so that only a lost state can differ."""
     assert one["step"] == other["step"]
     for part in ("pipeline", "optimizers"):
         assert_close(tensors_of(one[part]), tensors_of(other[part]), rtol=rtol, atol=atol)
@@ -121,10 +119,8 @@ def recorded() -> dict[str, dict[str, Any]]:
 
 
 def bound(case: str) -> float:
-    """PSNR that a training of the case must exceed: four deviations below the least of those recorded.
-
-    The deviation is over seeds, the largest of the cases on the same data set.
-    """
+    """PSNR that a training of the case must exceed: four deviations below the least of those recorded. The deviation is
+    over seeds, the largest of the cases on the same data set."""
     group = [one for name, one in recorded().items() if name.split("/")[0] == case.split("/")[0]]
     return min(recorded()[case]["psnr"]) - 4 * max(stdev(one["psnr"]) for one in group)
 

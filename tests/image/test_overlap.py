@@ -27,9 +27,7 @@ def painted(x, y):
 
 def photographs(stops, gloss: float = 0.0):
     """Views of the wall from 3 away, each a little to the right of the one before, with these stops [V, 3].
-
-    With gloss, a light that is brightest to the right of the camera adds stops, other ones in each place.
-    """
+    With gloss, a light that is brightest to the right of the camera adds stops, other ones in each place."""
     viewmats, images = torch.eye(4).repeat(len(stops), 1, 1), []
     viewmats[:, :3, 3] = -places(len(stops))
     column, row = torch.meshgrid(torch.arange(WIDTH) + 0.5, torch.arange(HEIGHT) + 0.5, indexing="xy")

@@ -20,10 +20,7 @@ STEPS = 60
 
 
 def viewer_pictures(device: str, scene: Path, out: Path) -> dict[str, torch.Tensor]:
-    """The picture of every mode, and one whose view is frozen, moved to the CPU.
-
-    The field is drawn at random, the same on every device.
-    """
+    """The picture of every mode, and one whose view is frozen, of a random field, the same on every device."""
     config = parse(["nrfgs", "--data", str(scene), "--output-dir", str(out), "--machine.device-type", device])
     config.pipeline.model.background_color = "black"
     config.pipeline.model.few_views = "off"

@@ -107,9 +107,7 @@ def test_flat_splat_has_finite_gradients():
 @pytest.mark.parametrize("near", [0.012, 0.1, 1.0])
 def test_gradients_of_compensations_near_the_camera(near):
     """What the blur adds to the determinant of a large splat is below float32's rounding of either determinant.
-
-    Each entry is a sum of some ten products: it may be off by 64 rounding units of the largest.
-    """
+    Each entry is a sum of some ten products: it may be off by 64 rounding units of the largest."""
     g = torch.Generator().manual_seed(0)
     depth = near * (1 + torch.rand(500, generator=g))
     means = torch.cat([0.3 * depth[:, None] * torch.randn(500, 2, generator=g), depth[:, None]], 1)
