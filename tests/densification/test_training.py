@@ -4,12 +4,11 @@
 from pathlib import Path
 
 import pytest
-import torch
 from densification_cases import arguments, trainer_of
 from short_trainings import assert_same_training, checkpoint_of, models_of, set_up
 
 from nrfgs_lab.training_run import train
-from nrfgs_ns.densification import CHANGE, UNSEEN, memory, statistics
+from nrfgs_ns.densification import CHANGE, UNSEEN, memory
 from nrfgs_ns.densification.strategy import HELD
 from nrfgs_ns.errors import InputError
 
@@ -89,39 +88,3 @@ def test_another_strategies_checkpoint_is_refused(tiny_scene, tmp_path):
     more = ["--load-dir", str(config.parent / "nerfstudio_models")]
     with pytest.raises(InputError, match="densification original"):
         set_up([*arguments(tiny_scene, tmp_path / "b", "mcmc"), *more])
-
-
-# The statistics' kernels on a GPU.
-def one_view() -> dict:
-    """What a camera saw: 3000 of 5000 splats, some of them of no size."""
-    torch.manual_seed(0)
-    rows = torch.randperm(5000, device="cuda")[:3000]
-    radii = torch.randint(0, 90, (3000,), dtype=torch.int32, device="cuda")
-    return {"width": 640, "height": 480, "n_cameras": 1, "gaussian_ids": rows, "radii": radii}
-
-
-@pytest.mark.gpu
-def test_one_camera_is_the_kernels(monkeypatch):
-    info = one_view()
-    info["radii"] += 1
-    state = {name: torch.zeros(5000, device="cuda") for name in ("grad2d", "count", "radii")}
-    gradients = torch.randn(3000, 2, device="cuda")
-    twin = {name: value.clone() for name, value in state.items()}
-    statistics.add_in_torch(twin, info["gaussian_ids"], gradients, info["radii"], (320.0, 240.0), 640.0)
-    monkeypatch.setattr(statistics, "add_in_torch", None)
-    statistics.take_statistics(state, info, gradients)
-    for name in state:
-        torch.testing.assert_close(state[name], twin[name], rtol=1e-6, atol=0.0)
-
-
-@pytest.mark.gpu
-def test_one_cameras_maxima_are_the_kernels(monkeypatch):
-    info = one_view()
-    maxima = [torch.full((5000,), start, device="cuda") for start in (0.0, 0.0, -2.0)]
-    step = torch.randn(3000, 2, device="cuda"), torch.rand(3000, device="cuda") - 0.5
-    twin = [value.clone() for value in maxima]
-    statistics.raise_in_torch(*twin, info["gaussian_ids"], info["radii"], *step, 640.0, (640.0, 480.0))
-    monkeypatch.setattr(statistics, "raise_in_torch", None)
-    statistics.take_maxima(*maxima, info, *step)
-    for value, other in zip(maxima, twin, strict=True):
-        torch.testing.assert_close(value, other, rtol=1e-6, atol=0.0)

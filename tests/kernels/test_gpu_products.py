@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The viewer's pictures and the exported files on a CUDA device. `pytest -m gpu`. On a CPU their rooms test them."""
+"""The viewer's pictures, exported files and the growth's statistics on a CUDA device; their rooms test them on a CPU."""
 
 import json
 from pathlib import Path
@@ -9,6 +9,7 @@ import torch
 from short_trainings import command_line, trained
 
 from nrfgs_lab.training_run import evaluate, parse
+from nrfgs_ns.densification import statistics
 from nrfgs_ns.export.command import Compact, Ply
 from nrfgs_ns.export.options import PlyOptions
 from nrfgs_ns.export.ply import read_splats
@@ -89,3 +90,37 @@ def test_every_mode(tiny_scene, tmp_path):
         # pixels have one. Changes are drawn AMPLIFICATION times as large, and viridis is less steep than 2.
         assert (error > 2 * AMPLIFICATION / 255).float().mean() < 0.01, name
         assert error.mean() < 1e-3, name
+
+
+# The growth's statistics.
+def one_view() -> dict:
+    """What a camera saw: 3000 of 5000 splats, some of them of no size."""
+    torch.manual_seed(0)
+    rows = torch.randperm(5000, device="cuda")[:3000]
+    radii = torch.randint(0, 90, (3000,), dtype=torch.int32, device="cuda")
+    return {"width": 640, "height": 480, "n_cameras": 1, "gaussian_ids": rows, "radii": radii}
+
+
+def test_one_camera_is_the_kernels(monkeypatch):
+    info = one_view()
+    info["radii"] += 1
+    state = {name: torch.zeros(5000, device="cuda") for name in ("grad2d", "count", "radii")}
+    gradients = torch.randn(3000, 2, device="cuda")
+    twin = {name: value.clone() for name, value in state.items()}
+    statistics.add_in_torch(twin, info["gaussian_ids"], gradients, info["radii"], (320.0, 240.0), 640.0)
+    monkeypatch.setattr(statistics, "add_in_torch", None)
+    statistics.take_statistics(state, info, gradients)
+    for name in state:
+        torch.testing.assert_close(state[name], twin[name], rtol=1e-6, atol=0.0)
+
+
+def test_one_cameras_maxima_are_the_kernels(monkeypatch):
+    info = one_view()
+    maxima = [torch.full((5000,), start, device="cuda") for start in (0.0, 0.0, -2.0)]
+    step = torch.randn(3000, 2, device="cuda"), torch.rand(3000, device="cuda") - 0.5
+    twin = [value.clone() for value in maxima]
+    statistics.raise_in_torch(*twin, info["gaussian_ids"], info["radii"], *step, 640.0, (640.0, 480.0))
+    monkeypatch.setattr(statistics, "raise_in_torch", None)
+    statistics.take_maxima(*maxima, info, *step)
+    for value, other in zip(maxima, twin, strict=True):
+        torch.testing.assert_close(value, other, rtol=1e-6, atol=0.0)
