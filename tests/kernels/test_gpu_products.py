@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The viewer's pictures, exported files and the growth's statistics on a CUDA device; their rooms test them on a CPU."""
+"""Pictures, exported files and the growth's statistics on a CUDA device. On a CPU their rooms test them."""
 
 import json
 from pathlib import Path
