@@ -75,12 +75,15 @@ def test_images_are_made_smaller_to_the_size_of_their_cameras(tmp_path):
     assert (data.train_dataset.cameras.width == 28).all() and (data.train_dataset.cameras.height == 5).all()
 
 
-def test_images_of_another_size_and_states_of_other_runs_are_refused(capture):
+def test_image_of_another_size_is_named(capture):
     """Other parsers than ours do not compare sizes; here the file changes after parsing."""
     data = manager(capture)
     Image.new("RGB", (9, 12)).save(capture.folder / "images/003.png")
     with pytest.raises(InputError, match=r"003.png is 9 x 12, but its camera 12 x 9"):
         data.load_all_images()
+
+
+def test_states_of_other_runs_are_refused(capture):
     state = manager(capture).sampling_state()
     with pytest.raises(InputError, match=r"strategy random, but now.*fps"):
         manager(capture, train_cameras_sampling_strategy="fps").load_sampling_state(state)
