@@ -22,8 +22,7 @@ sys.path[:0] = [
     str(HERE / name) for name in ("helpers", "fixtures", "appearance", "densification", "image", "rasterizer")
 ]
 
-from quick_start import keep_what_is_imported, let_go  # noqa: E402
-from without_open3d import hide_open3d, open3d_shown  # noqa: E402
+from processes import hide_open3d, keep_what_is_imported, let_go, open3d_shown  # noqa: E402
 
 hide_open3d()
 
@@ -50,17 +49,6 @@ def pytest_collection_finish():
 
 def pytest_unconfigure():
     let_go()
-
-
-@pytest.fixture(scope="module")
-def browser():
-    """A headless Chromium; skips where there is none."""
-    from nrfgs_lab.pages.pictures import CHROMIUM, chromium
-
-    if CHROMIUM is None:
-        pytest.skip("no Chromium on the path: apt-get install chromium")
-    with chromium() as browser:
-        yield browser
 
 
 @pytest.fixture

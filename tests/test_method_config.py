@@ -1,45 +1,41 @@
 # SPDX-License-Identifier: Apache-2.0
 """The menu: registered, light to import, and splatfacto's to the number."""
 
+import re
+import runpy
 import subprocess
 import sys
 from dataclasses import fields
+from importlib.metadata import entry_points
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
 import tyro
 from nerfstudio.configs import external_methods
-from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods, method_configs
+from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods, merge_methods, method_configs
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
+from nerfstudio.plugins.registry import discover_methods
 
+from nrfgs_ns import method_config as menu
 from nrfgs_ns.appearance.gsnb import NeuralBasis
 from nrfgs_ns.appearance.nrf import NeuralResidualField
 from nrfgs_ns.appearance.sg import SphericalGaussians
 from nrfgs_ns.appearance.sh import SphericalHarmonics
 from nrfgs_ns.appearance.vdgs import ViewDirectionFactors
 from nrfgs_ns.densification import Splatfacto
-from nrfgs_ns.method_config import (
-    nrfgs,
-    nrfgs_best,
-    nrfgs_fast,
-    nrfgs_gsnb,
-    nrfgs_harmonics,
-    nrfgs_sg,
-    nrfgs_sh,
-    nrfgs_vdgs,
-)
 from nrfgs_ns.training.identity import leaves
 
 METHODS = {
-    "nrfgs": (nrfgs, NeuralResidualField, {"latents", "field"}),
-    "nrfgs-sh": (nrfgs_sh, SphericalHarmonics, set()),
-    "nrfgs-vdgs": (nrfgs_vdgs, ViewDirectionFactors, {"field"}),
-    "nrfgs-gsnb": (nrfgs_gsnb, NeuralBasis, {"field"}),
-    "nrfgs-sg": (nrfgs_sg, SphericalGaussians, {"sg_axes", "sg_sharpness", "sg_colors"}),
+    "nrfgs": (menu.nrfgs, NeuralResidualField, {"latents", "field"}),
+    "nrfgs-sh": (menu.nrfgs_sh, SphericalHarmonics, set()),
+    "nrfgs-vdgs": (menu.nrfgs_vdgs, ViewDirectionFactors, {"field"}),
+    "nrfgs-gsnb": (menu.nrfgs_gsnb, NeuralBasis, {"field"}),
+    "nrfgs-sg": (menu.nrfgs_sg, SphericalGaussians, {"sg_axes", "sg_sharpness", "sg_colors"}),
 }
 """Of each method: its specification, its head, and the groups of parameters that its head adds."""
-PRESETS = {"nrfgs-fast": nrfgs_fast, "nrfgs-best": nrfgs_best, "nrfgs-harmonics": nrfgs_harmonics}
+PRESETS = {"nrfgs-fast": menu.nrfgs_fast, "nrfgs-best": menu.nrfgs_best, "nrfgs-harmonics": menu.nrfgs_harmonics}
 
 
 @pytest.mark.parametrize("name", [*METHODS, *PRESETS])
@@ -60,7 +56,7 @@ def test_each_method_has_its_head_and_an_optimiser_for_all_that_it_learns(name):
 
 
 @pytest.mark.parametrize(
-    "method, kind, decay", [(nrfgs_vdgs, torch.optim.Adam, 0.0), (nrfgs_gsnb, torch.optim.AdamW, 0.01)]
+    "method, kind, decay", [(menu.nrfgs_vdgs, torch.optim.Adam, 0.0), (menu.nrfgs_gsnb, torch.optim.AdamW, 0.01)]
 )
 def test_shared_weights_of_others_have_their_references_optimisers(method, kind, decay):
     config = method.config.optimizers["field"]
@@ -107,30 +103,27 @@ def test_everything_else_is_splatfactos(name):
         assert getattr(datamanager, field) == getattr(host_datamanager, field), field
 
 
-@pytest.mark.parametrize(
-    "name, differs",
-    [
-        ("nrfgs-fast", {"max_num_iterations": 10_000, "schedule_steps": 30_000, "average_steps": 200}),
-        (
-            "nrfgs-best",
-            {
-                "max_num_iterations": 30_000,
-                "average_steps": 200,
-                "pipeline.model.densification": "error-guided,threshold=0.0016",
-            },
-        ),
-    ],
-)
+@pytest.mark.parametrize("name, differs", [
+    ("nrfgs-fast", {"max_num_iterations": 10_000, "schedule_steps": 30_000, "average_steps": 200}),
+    (
+        "nrfgs-best",
+        {
+            "max_num_iterations": 30_000,
+            "average_steps": 200,
+            "pipeline.model.densification": "error-guided,threshold=0.0016",
+        },
+    ),
+])  # fmt: skip
 def test_a_preset_differs_in_what_it_says_and_shares_nothing(name, differs):
-    ours, base = dict(leaves(PRESETS[name].config)), dict(leaves(nrfgs.config))
+    ours, base = dict(leaves(PRESETS[name].config)), dict(leaves(menu.nrfgs.config))
     assert ours.keys() == base.keys()
     changed = {key: ours[key] for key in ours if str(ours[key]) != str(base[key])}
     assert changed == {"method_name": name, **differs}
-    assert PRESETS[name].config.pipeline.model.appearance is not nrfgs.config.pipeline.model.appearance
+    assert PRESETS[name].config.pipeline.model.appearance is not menu.nrfgs.config.pipeline.model.appearance
 
 
 def test_harmonics_have_all_rules_that_are_not_the_fields():
-    ours, field, plain = (dict(leaves(method.config)) for method in (nrfgs_harmonics, nrfgs, nrfgs_sh))
+    ours, field, plain = (dict(leaves(method.config)) for method in (menu.nrfgs_harmonics, menu.nrfgs, menu.nrfgs_sh))
     rules = {f"pipeline.model.{name}" for name in ("densification", "dense_start", "near_plane", "shrinkage")}
     rules |= {"max_num_iterations"}
     assert {key for key in ours if str(ours[key]) != str(plain[key])} == {"method_name", *rules}
@@ -164,3 +157,36 @@ def test_registering_pulls_in_no_gpu_code_and_no_training_tools():
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=300)
     assert run.stdout.strip().endswith("[]")
     assert "leaked" not in run.stderr
+
+
+# The entry for nerfstudio's list of external methods, in the installed nerfstudio's own loader.
+LISTING = Path(__file__).resolve().parents[1] / "docs" / "nerfstudio"
+
+
+@pytest.fixture
+def entry(monkeypatch):
+    """The entry, alone in the list."""
+    monkeypatch.setattr(external_methods, "external_methods", [])
+    runpy.run_path(str(LISTING / "external_method.py"))
+    (entry,) = external_methods.external_methods
+    return entry
+
+
+def test_it_lists_methods_that_the_package_registers(entry):
+    listed, descriptions = external_methods.get_external_methods()
+    registered, described = discover_methods()
+    assert "nrfgs" in listed and listed.keys() <= registered.keys()
+    assert listed.keys() <= set(entry_points(group="nerfstudio.method_configs").names)
+    # As nerfstudio merges them: an installed method is not replaced by its entry, and without it the entry is shown.
+    merged, _ = merge_methods(registered, described, listed, descriptions, overwrite=False)
+    assert all(merged[name] is registered[name] for name in listed)
+    alone, texts = merge_methods({}, {}, listed, descriptions, overwrite=False)
+    assert alone == listed and all(f"ns-train {name}" in texts[name] for name in listed)
+
+
+def test_the_page_is_where_the_entry_says(entry):
+    (name,) = re.findall(r"https://docs.nerf.studio/nerfology/methods/(\w+).html", entry.instructions)
+    page = (LISTING / f"{name}.md").read_text(encoding="utf-8")
+    assert f"pip install {entry.pip_package}\n" in page
+    assert all(f"`{method}`" in page or f"ns-train {method} " in page for method, _ in entry.configurations)
+    assert not re.findall(r"\]\((?!https://)", page), "links and pictures of another site"

@@ -1,25 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fused kernels in Triton's interpreter against PyTorch's float64 field.
-
-Run by kernels/test_interpreted.py.
-"""
+"""The fused kernels in Triton's interpreter against PyTorch's float64 field."""
 
 import pytest
 import quick_interpreter  # noqa: F401
 import torch
 import triton
 import triton.language as tl
-from fused_cases import (
-    ULP,
-    assert_near,
-    compare,
-    evaluate,
-    float32_tolerance,
-    heads,
-    relative_errors,
-    rounding,
-    scene,
-)
+from fused_cases import ULP, assert_near, compare, evaluate, float32_tolerance, heads, relative_errors, rounding, scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -27,12 +14,20 @@ from nrfgs_ns.appearance.fused import launch
 from nrfgs_ns.appearance.fused.kernels import _waves
 
 
-@pytest.mark.parametrize("repeated", [False, True])
+@pytest.fixture
+def memory_begins_as_nan():
+    torch.use_deterministic_algorithms(True)
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+@pytest.mark.parametrize("count, visible, repeated", [(230, 200, False), (30, 200, True), (70, 70, False)])
 @pytest.mark.parametrize("opacity_bound", ["straight-through", "logit"])
-def test_values_and_gradients(opacity_bound, repeated):
+def test_values_and_gradients(opacity_bound, count, visible, repeated, memory_begins_as_nan):
+    """Of some rows, in three blocks and a part of one, so that a program sees several; of repeated rows, whose
+    gradients add up; and of all, whose gradients are written without being cleared before."""
     head, twin = heads(opacity_bound=opacity_bound)
-    # Three blocks and a part of one, so that a program sees several; repeated rows add their gradients up.
-    compare(head, twin, scene(head, 230 if not repeated else 30, 200, repeated), float32_tolerance())
+    compare(head, twin, scene(head, count, visible, repeated), float32_tolerance())
 
 
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
@@ -101,19 +96,6 @@ def test_the_next_way_is_taken_where_the_first_does_not_run(monkeypatch):
     head, twin = heads(precision="bf16")
     compare(head, rounding(twin, launch.KINDS["bf16"]), scene(head, 150, 140), 2.0**-13)
     assert tried == [first, second]
-
-
-@pytest.fixture
-def memory_begins_as_nan():
-    torch.use_deterministic_algorithms(True)
-    yield
-    torch.use_deterministic_algorithms(False)
-
-
-def test_gradients_that_are_not_cleared_are_written(memory_begins_as_nan):
-    """All rows visible to one camera."""
-    head, twin = heads()
-    compare(head, twin, scene(head, 70, 70), float32_tolerance())
 
 
 EXTREMES = {

@@ -4,12 +4,10 @@
 import copy
 
 import torch
+from fused_cases import ULP
 from torch import Tensor
 
 from nrfgs_ns.appearance.hash_grid import FEATURES, HashGrid
-
-ULP = 2.0**-24
-"""Relative rounding error of float32."""
 
 
 def grids(device: str = "cpu", **options) -> tuple[HashGrid, HashGrid]:

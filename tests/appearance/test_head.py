@@ -56,14 +56,18 @@ def test_gradients_agree_with_finite_differences(name, monkeypatch):
     assert torch.autograd.gradcheck(f, [x.requires_grad_() for x in inputs])
 
 
-def test_float32_is_float64_up_to_rounding(config):
-    """How far rounding can go is measured: in float64, every number that goes in is off by a random 8 units (2^-24).
+@pytest.mark.parametrize("size", [1.0, 1e-6, 1e6])
+def test_float32_is_float64_up_to_rounding(config, size):
+    """In scenes of any size, with latents as large.
 
-    8 is about how many operations deep each stage is. The tolerance is 8 times the largest change in 6 such runs, and
-    64 units of 1 for the sums over up to 64 terms.
+    How far rounding can go is measured: in float64, every number that goes in is off by a random 8 units (2^-24). 8 is
+    about how many operations deep each stage is. The tolerance is 8 times the largest change in 6 such runs, and 64
+    units of 1 for the sums over up to 64 terms.
     """
     head = awake(config)
     splats, visible, centers = scene(head)
+    splats = {name: value * (size if name in ("means", "latents") else 1) for name, value in splats.items()}
+    centers = size * centers
     exact = head(splats, visible, centers)
     unit = 2.0**-24
 

@@ -3,11 +3,14 @@ import math
 
 import pytest
 import torch
+from fused_cases import heads
+from fused_cases import scene as fused_scene
 from head_cases import awake, scene, shared_weights
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.head import SH_C0
 from nrfgs_ns.appearance.nrf import NrfConfig, bounded_opacity
+from nrfgs_ns.errors import InputError
 
 
 def by_hand(head, splats, visible, centers):
@@ -77,16 +80,13 @@ def test_zero_outputs_add_nothing():
     assert awake(NrfConfig()).neutral_loss(splats, visible, centers) > 0.0
 
 
-def test_straight_through_is_a_clamp_whose_gradient_ignores_it():
+def test_straight_through_is_a_clamp_whose_gradient_ignores_it_and_logit_the_residual_at_half_opacity():
     logit = torch.tensor([[-3.0], [0.0], [3.0]], dtype=torch.double)
     residual = torch.tensor([[-1.0], [0.5], [1.0]], dtype=torch.double, requires_grad=True)
     opacity = bounded_opacity(logit, residual, 0.2, "straight-through")
     assert_close(opacity.detach().squeeze(), torch.tensor([0.0, 0.6, 1.0], dtype=torch.double))
     opacity.sum().backward()
     assert residual.grad.squeeze().tolist() == [0.2, 0.2, 0.2]
-
-
-def test_logit_bound_is_the_residual_at_half_opacity():
     residual = torch.tensor([[1e-4]], dtype=torch.double)
     opacity = bounded_opacity(torch.zeros(1, 1, dtype=torch.double), residual, 0.2, "logit")
     # The sigmoid has no second derivative at 0; the third leaves (4 * 0.2e-4)^3 / 48.
@@ -99,3 +99,27 @@ def test_logit_bound_is_the_residual_at_half_opacity():
 def test_impossible_settings_are_named(field, value):
     with pytest.raises(ValueError, match=f"appearance.{field} is {value!r}"):
         NrfConfig(**{field: value}).setup()
+
+
+# When the fused kernels are chosen; fused_interpreted.py tests them.
+def test_cpu_takes_torch(monkeypatch):
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    head = NrfConfig().setup()
+    splats, _, _ = fused_scene(head, 20, 15)
+    assert not head.fused.takes(splats)
+
+
+@pytest.mark.parametrize("interpreted, dtype, sizes, reason", [
+    ("0", torch.float32, {}, "the splats are on cpu"),
+    ("1", torch.float64, {}, "the splats are not float32"),
+    *(
+        ("1", torch.float32, sizes, "its sizes are beyond the kernels'")
+        for sizes in ({"latent_dim": 65}, {"hidden_width": 129}, {"hidden_width": 65, "num_bands": 5})
+    ),
+])  # fmt: skip
+def test_demanding_the_impossible_names_the_reason(interpreted, dtype, sizes, reason, monkeypatch):
+    monkeypatch.setenv("TRITON_INTERPRET", interpreted)
+    head, _ = heads(**sizes)
+    splats, visible, centers = fused_scene(head, 20, 15)
+    with pytest.raises(InputError, match=f"implementation is 'fused', but {reason}.*auto or torch"):
+        head({**splats, "latents": splats["latents"].to(dtype)}, visible, centers)

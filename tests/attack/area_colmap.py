@@ -5,12 +5,11 @@ from functools import partial
 from pathlib import Path
 
 from area_transforms import load
-from attempt import Case
+from attempt import DAMAGES, Case, damage
 from hypothesis import strategies as st
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from PIL import Image
 from small_colmap import FILES, MODEL, Model
-from values import DAMAGES, damage
 
 AREA = "COLMAP model"
 load = partial(load, parser=ColmapDataParserConfig)

@@ -10,11 +10,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 from area_transforms import broken
-from attempt import Case
+from attempt import DAMAGES, Case, damage
 from hypothesis import strategies as st
 from PIL import Image
 from small_capture import Capture
-from values import DAMAGES, damage
 
 AREA = "images and masks"
 EPS = (

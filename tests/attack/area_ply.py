@@ -3,10 +3,9 @@
 
 import numpy as np
 from area_transforms import add_points, broken
-from attempt import Case
+from attempt import DAMAGES, Case, damage
 from hypothesis import strategies as st
 from small_capture import Capture
-from values import DAMAGES, damage
 
 AREA = ".ply of points"
 

@@ -7,10 +7,9 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from attempt import Case
+from attempt import REPLACEMENTS, Case, replace_in
 from hypothesis import strategies as st
 from small_capture import Capture
-from values import REPLACEMENTS, replace_in
 
 from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hostile inputs are refused with one clear sentence (see `attempt`), whatever is wrong with them.
-
-`python tests/attack/table.py` runs more of them and prints the table of docs/troubleshooting.md.
-"""
+"""Hostile inputs are refused with one clear sentence (see `attempt`), whatever is wrong with them. `table.py` runs more
+of them and prints the table of docs/troubleshooting.md."""
 
 import json
 import os

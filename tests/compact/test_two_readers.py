@@ -21,7 +21,9 @@ import compact_fields
 import numpy as np
 import pytest
 import torch
-from compact_fields import RENDER, field, in_node
+from compact_fields import RENDER, field, in_node, read_container
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.field import Field
@@ -29,7 +31,7 @@ from nrfgs_ns.appearance.head import base_colors
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.compact.decode import Decoded, decode
 from nrfgs_ns.compact.encode import encode
-from nrfgs_ns.compact.format import MODEL, PREAMBLE, Table, _pack, _unpack, container
+from nrfgs_ns.compact.format import BROKEN, MODEL, PREAMBLE, Table, _pack, _unpack, container
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.trained.loading import load_file
 
@@ -148,14 +150,8 @@ def containers() -> Iterator[tuple[str, bytes]]:
     for name, change in {
         "in another order": lambda h, b: (h["streams"].reverse(), b.reverse()),
         "a stream twice": lambda h, b: (h["streams"].append(dict(h["streams"][0])), b.append(b[0])),
-        "a stream of another name": lambda h, b: (
-            h["streams"].append({**h["streams"][0], "name": "x"}),
-            b.append(b[0]),
-        ),
-        "a weight too many": lambda h, b: (
-            h["streams"].append({**h["streams"][-1], "name": "head.x"}),
-            b.append(b[-1]),
-        ),
+        "of another name": lambda h, b: (h["streams"].append({**h["streams"][0], "name": "x"}), b.append(b[0])),
+        "a weight": lambda h, b: (h["streams"].append({**h["streams"][-1], "name": "head.x"}), b.append(b[-1])),
         "a stream less": lambda h, b: (h["streams"].pop(), b.pop()),
     }.items():
         header, bodies = parts()
@@ -246,15 +242,8 @@ def rans_streams() -> Iterator[tuple[str, bytes]]:
         for sizes in ((0, 0), (2**32 - 1, size), (count, 2**32 - 1), (2**30, 8)):
             yield f"{name}: sizes {sizes}", with_body(name, lambda b, s=sizes: MODEL.pack(*s) + b[8:])
         rows = {"means": 2, "splats": 10, "latents": 8}[name]
-        for shape in (
-            [rows, 10**6],
-            [10**6, 1],
-            [1024, 2000],
-            [rows, 0],
-            [0, COUNT],
-            [rows, COUNT - 1],
-            [rows - 1, COUNT],
-        ):
+        near = [rows, 0], [0, COUNT], [rows, COUNT - 1], [rows - 1, COUNT]
+        for shape in ([rows, 10**6], [10**6, 1], [1024, 2000], *near):
             yield f"{name}: shape {shape}", with_body(name, lambda body: body, shape=shape)
         for dtype in ("int16", "int32", "uint32"):
             yield f"{name}: {dtype}", with_body(name, lambda body: body, dtype=dtype)
@@ -306,10 +295,8 @@ def contents() -> Iterator[tuple[str, bytes]]:
     for name, grid in fields["grids"].items():
         for part in ("low", "step"):
             for value in (1e-320, 1e37, 1e38, 3.5e38, 1e308, -1e38, 0):
-                yield (
-                    f"{name} {part} {value}",
-                    with_stream("", None, **{f"grids__{name}__{part}": [value] * len(grid[part])}),
-                )
+                changed = {f"grids__{name}__{part}": [value] * len(grid[part])}
+                yield f"{name} {part} {value}", with_stream("", None, **changed)
 
 
 def whole_files() -> Iterator[tuple[str, bytes]]:
@@ -410,6 +397,15 @@ def agree(cases: dict[str, bytes], found: list[dict], folder: Path) -> None:
 def test_both_readers_refuse_the_same_files(cases, tmp_path):
     (tmp_path / "cases.json").write_text(json.dumps([base64.b64encode(data).decode() for data in cases.values()]))
     agree(cases, in_node(READ, tmp_path), tmp_path)
+
+
+@settings(max_examples=150)
+@given(st.integers(0, 10**6), st.integers(1, 255))
+def test_a_changed_byte_is_noticed(at, by):
+    """CRC-32 finds every change of one byte; the length finds the file's own."""
+    data = written()
+    with pytest.raises(BROKEN):
+        read_container(flipped(at % len(data), by)(data))
 
 
 def test_what_is_read_can_be_shown(tmp_path):

@@ -23,8 +23,6 @@ def manager(capture, parser_options=None, **options) -> NrfgsDatamanager:
 
 
 # Images.
-
-
 @pytest.mark.parametrize("scale", [1.0, 0.5])
 @pytest.mark.parametrize("mode", ["RGB", "RGBA", "L"])
 @pytest.mark.parametrize("kind", ["uint8", "float32"])
@@ -85,6 +83,14 @@ def test_image_of_another_size_is_named(capture):
         data.load_all_images()
 
 
+def test_states_of_other_runs_are_refused(capture):
+    state = manager(capture).sampling_state()
+    with pytest.raises(InputError, match=r"strategy random, but now.*fps"):
+        manager(capture, train_cameras_sampling_strategy="fps").load_sampling_state(state)
+    with pytest.raises(InputError, match=r"trained on 8 images.*now these are 5"):
+        manager(capture, {"eval_interval": 2}).load_sampling_state(state)
+
+
 @pytest.mark.parametrize("factor", [1, 2])
 def test_jpeg_masks_are_halved(capture, factor):
     """JPEG rings: outside is not quite 0."""
@@ -129,8 +135,6 @@ def test_undistorted_images_can_be_read_again(capture):
 
 
 # The order of cameras.
-
-
 def next_cameras(data, count: int) -> list[int]:
     return [data.next_train(0)[0].metadata["cam_idx"] for _ in range(count)]
 
@@ -160,17 +164,7 @@ def test_order_continues_after_a_restore(capture, strategy, steps):
     assert len(set(expected)) > 3
 
 
-def test_states_of_other_runs_are_refused(capture):
-    state = manager(capture).sampling_state()
-    with pytest.raises(InputError, match=r"strategy random, but now.*fps"):
-        manager(capture, train_cameras_sampling_strategy="fps").load_sampling_state(state)
-    with pytest.raises(InputError, match=r"trained on 8 images.*now these are 5"):
-        manager(capture, {"eval_interval": 2}).load_sampling_state(state)
-
-
 # Where images are kept.
-
-
 @pytest.mark.parametrize("distorted", [False, True])
 def test_images_in_files_are_those_in_memory(capture, tmp_path, monkeypatch, printed, distorted):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

@@ -74,8 +74,6 @@ def test_cameras_are_those_of_nerfstudio(capture, split, distortion):
 
 
 # Splits.
-
-
 @pytest.mark.parametrize("kept, other", [("val", {}), ("val", {"test_filenames": []}), ("test", {})])
 def test_val_and_test_stand_in_for_each_other(capture, printed, kept, other):
     path = [frame["file_path"] for frame in capture.meta["frames"]]
@@ -107,8 +105,6 @@ def test_one_image(tmp_path, printed, orientation, center):
 
 
 # Points.
-
-
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("kind", ["uchar", "int", "float", "none"])
 def test_ply(capture, printed, monkeypatch, text, kind):
@@ -176,8 +172,6 @@ def test_points_of_colmap_without_a_question(capture, monkeypatch, write, name, 
 
 
 # The house around it.
-
-
 def test_rendering_from_a_checkpoint_needs_no_files(capture):
     capture.add_masks()
     capture.add_ply(*cloud()).unlink()

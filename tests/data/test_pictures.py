@@ -87,11 +87,8 @@ def photographed(path, **details):
     return path
 
 
-def test_a_photograph_says_how_it_was_taken(tmp_path):
+def test_a_photograph_says_how_it_was_taken_and_what_is_no_number_is_left_out(tmp_path):
     assert read_exif(photographed(tmp_path / "a.jpg")) == pytest.approx(TAKEN)
-
-
-def test_what_is_no_number_is_left_out(tmp_path):
     path = photographed(tmp_path / "a.jpg", ExposureTime=0.0, ISOSpeedRatings=(0, 100), FNumber=-1.0)
     assert not {"exposure_time", "f_number", "iso"} & set(read_exif(path))
     Image.new("RGB", (8, 6)).save(tmp_path / "b.png")

@@ -9,16 +9,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch.nn.functional import avg_pool2d
 
-from nrfgs_ns.data.plane_sweep import (
-    KEPT,
-    WINDOW,
-    Views,
-    _mean_of_largest,
-    _window_mean,
-    dense_points,
-    share_kept,
-    small_views,
-)
+from nrfgs_ns.data import plane_sweep as sweep
 from nrfgs_ns.training.dense_start import start_with_dense_points
 
 SIZE, FOCAL, DISTANCE = 48, 60.0, 4.0
@@ -46,7 +37,7 @@ def plane(centers, unit=1.0, brightness=(1.0,), pattern=texture):
     K = torch.tensor([[FOCAL, 0, SIZE / 2], [0, FOCAL, SIZE / 2], [0, 0, 1]]).repeat(len(eye), 1, 1)
     flat = torch.rand(200, 2, generator=torch.Generator().manual_seed(1)) * 2 - 1
     points = torch.cat([flat, DISTANCE + flat[:, :1] / 4], dim=1)
-    return small_views(rgb, [None] * len(rgb), K, poses), points * unit
+    return sweep.small_views(rgb, [None] * len(rgb), K, poses), points * unit
 
 
 AROUND = [(0.5 * math.cos(a), 0.5 * math.sin(a)) for a in (0, 1.2, 2.5, 3.7, 5.0)]
@@ -54,7 +45,7 @@ AROUND = [(0.5 * math.cos(a), 0.5 * math.sin(a)) for a in (0, 1.2, 2.5, 3.7, 5.0
 
 @pytest.mark.parametrize("unit", [1.0, 1000.0, 1e-3])
 def test_points_lie_on_what_the_views_show_in_any_unit(unit):
-    xyz, rgb = dense_points(*plane(AROUND, unit), share=1.0)
+    xyz, rgb = sweep.dense_points(*plane(AROUND, unit), share=1.0)
     xyz = xyz / unit
     off = (xyz[:, 2] - DISTANCE - xyz[:, 0] / 4).abs() / DISTANCE
     assert len(xyz) > 1000
@@ -62,20 +53,17 @@ def test_points_lie_on_what_the_views_show_in_any_unit(unit):
     torch.testing.assert_close(rgb[off < 0.003], texture(xyz[:, 0], xyz[:, 1])[off < 0.003], atol=0.1, rtol=0)
 
 
-def test_exposure_does_not_matter():
-    even, _ = dense_points(*plane(AROUND), share=1.0)
-    uneven, _ = dense_points(*plane(AROUND, brightness=(1.0, 0.7, 0.9)), share=1.0)
+def test_exposure_does_not_matter_and_nothing_is_found_where_nothing_can_be_told():
+    even, _ = sweep.dense_points(*plane(AROUND), share=1.0)
+    uneven, _ = sweep.dense_points(*plane(AROUND, brightness=(1.0, 0.7, 0.9)), share=1.0)
     assert len(uneven) == pytest.approx(len(even), rel=0.05)
-
-
-def test_nothing_is_found_where_nothing_can_be_told():
     same_place = plane([(0.0, 0.0)] * 4)
     plain = plane(AROUND, pattern=lambda x, y: 0.5 + 0 * torch.stack([x, y, x], dim=-1))
     masked, points = plane(AROUND)
     masked = masked._replace(valid=torch.zeros_like(masked.valid))
     two = plane(AROUND[:2])
     for views, own in (same_place, plain, (masked, points), two):
-        xyz, rgb = dense_points(views, own, share=1.0)
+        xyz, rgb = sweep.dense_points(views, own, share=1.0)
         assert xyz.shape == rgb.shape == (0, 3)
 
 
@@ -86,20 +74,20 @@ def test_masks_and_transparency_are_no_places_for_points():
     mask[:, :20] = False
     upright = torch.full((300, 100, 3), 128, dtype=torch.uint8)
     K = torch.eye(3).repeat(2, 1, 1)
-    views = small_views([image, upright], [mask, None], K, torch.eye(4).repeat(2, 1, 1))
-    assert isinstance(views, Views) and views.rgb.shape == (2, 256, 96, 3)
+    views = sweep.small_views([image, upright], [mask, None], K, torch.eye(4).repeat(2, 1, 1))
+    assert isinstance(views, sweep.Views) and views.rgb.shape == (2, 256, 96, 3)
     assert not views.valid[0, :10].any() and not views.valid[0, :, :20].any() and views.valid[0, 10:48, 20:].all()
     assert not views.valid[0, 48:].any() and not views.valid[1, :, 85:].any() and views.valid[1, :, :85].all()
     torch.testing.assert_close(views.intrinsics[1].diagonal(), torch.tensor([0.85, 256 / 300, 1.0]))
 
 
 def test_the_share_falls_smoothly_to_nothing():
-    shares = [share_kept(views) for views in range(3, 400)]
-    assert shares[0] == pytest.approx(KEPT, rel=0.01) and shares[-1] == 0
-    assert all(0 <= a - b < 0.02 * KEPT + 0.05 * KEPT * (b == 0) for a, b in zip(shares, shares[1:], strict=False))
-    few, _ = dense_points(*plane(AROUND), share=0.25)
-    again, _ = dense_points(*plane(AROUND), share=0.25)
-    every, _ = dense_points(*plane(AROUND), share=1.0)
+    shares = [sweep.share_kept(views) / sweep.KEPT for views in range(3, 400)]
+    assert shares[0] == pytest.approx(1.0, rel=0.01) and shares[-1] == 0
+    assert all(0 <= a - b < 0.02 + 0.05 * (b == 0) for a, b in zip(shares, shares[1:], strict=False))
+    few, _ = sweep.dense_points(*plane(AROUND), share=0.25)
+    again, _ = sweep.dense_points(*plane(AROUND), share=0.25)
+    every, _ = sweep.dense_points(*plane(AROUND), share=1.0)
     assert len(few) == pytest.approx(len(every) / 4, rel=0.2) and torch.equal(few, again)
 
 
@@ -135,9 +123,9 @@ def test_the_quick_means_are_torchs():
     draw = torch.Generator().manual_seed(0)
     images, rows = torch.rand(3, 2, 19, 23, generator=draw), torch.rand(6, 50, generator=draw)
     window = images
-    for size in ((1, WINDOW), (WINDOW, 1)):
+    for size in ((1, sweep.WINDOW), (sweep.WINDOW, 1)):
         padding = size[0] // 2, size[1] // 2
         window = avg_pool2d(window, size, stride=1, padding=padding, count_include_pad=False)
-    assert torch.equal(_window_mean(images), window)
+    assert torch.equal(sweep._window_mean(images), window)
     for count in (1, 3, 6):
-        assert torch.equal(_mean_of_largest(rows, count), rows.topk(count, dim=0).values.mean(dim=0))
+        assert torch.equal(sweep._mean_of_largest(rows, count), rows.topk(count, dim=0).values.mean(dim=0))

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Captures in coordinates of the earth, and whether cameras see what training starts from."""
 
-import json
-
 import numpy as np
 import pytest
 import torch
@@ -52,20 +50,6 @@ def test_coordinates_of_the_earth_lose_nothing(tmp_path, orientation, center):
     assert (to_capture(near)[1] == 0).all()
 
 
-def test_what_nerfstudio_writes_beside_the_checkpoints_leads_back(tmp_path):
-    far, xyz = with_points(tmp_path / "far", UTM)
-    outputs = far.parse()
-    outputs.save_dataparser_transform(tmp_path / "dataparser_transforms.json")
-    saved = json.loads((tmp_path / "dataparser_transforms.json").read_text())
-    transform, scale = np.array(saved["transform"]), saved["scale"]
-    back = (outputs.metadata["points3D_xyz"].numpy() / scale - transform[:, 3]) @ transform[:, :3]
-    np.testing.assert_allclose(back, xyz, atol=1e-5, rtol=0)
-    poses = outputs.transform_poses_to_original_space(outputs.cameras.camera_to_worlds, "opengl")
-    truth = {frame["file_path"][-7:]: np.array(frame["transform_matrix"]) for frame in far.meta["frames"]}
-    for path, pose in zip(outputs.image_filenames, poses.numpy(), strict=True):
-        np.testing.assert_allclose(pose, truth[path.name][:3], atol=1e-5, rtol=0)
-
-
 def test_an_applied_transform_is_part_of_the_way_back(tmp_path):
     """The capture's own world is that from before it."""
     far, xyz = with_points(tmp_path / "far", UTM)
@@ -77,8 +61,6 @@ def test_an_applied_transform_is_part_of_the_way_back(tmp_path):
 
 
 # What the cameras see.
-
-
 def turn_away(frame) -> None:
     matrix = np.array(frame["transform_matrix"])
     matrix[:3, [0, 2]] *= -1
@@ -120,8 +102,6 @@ def test_empty_masks_are_named(tmp_path, printed):
 
 
 # Fisheyes.
-
-
 @pytest.mark.parametrize("k1", [0.0, 0.05])
 def test_a_fisheye_is_undistorted(tmp_path, k1):
     """What is in memory is what a pinhole sees of a world whose colour depends on direction."""

@@ -59,15 +59,9 @@ def errors(size: int, scale: float = 1.0, views: int = 2, cameras_at_once: bool 
     return strategy.state[ERROR]
 
 
-def test_the_error_does_not_depend_on_the_size_of_images():
+def test_the_error_is_the_largest_of_a_view_whatever_the_unit_and_the_size_and_number_of_images():
     assert_close(errors(96), errors(192), rtol=0.06, atol=1e-4)
-
-
-def test_the_error_does_not_depend_on_the_unit_of_the_scene():
     assert_close(errors(64, scale=2.0), errors(64), rtol=1e-3, atol=1e-6)
-
-
-def test_the_error_is_the_largest_of_a_view_however_many_there_are():
     assert (errors(64, views=4) >= errors(64, views=2) - 1e-7).all()
     assert_close(errors(64, views=2, cameras_at_once=True), errors(64, views=2), rtol=1e-4, atol=1e-7)
 
@@ -192,22 +186,10 @@ def test_opacities_decay_less_and_less():
     assert taken == pytest.approx([DECAY * (1 - step / 30_000) for step in (600, 15_000, 24_800)], abs=1e-6)
 
 
-def test_a_budget_above_the_cap_is_refused():
+def test_growth_ends_at_the_cap_and_in_time():
     with pytest.raises(InputError, match="budget is 50; it must be at most most_splats, 40"):
         ErrorGuided(budget=50, most_splats=40).check()
-
-
-def test_growth_ends_at_the_cap_and_in_time():
     for step, options, count in ((600, {"most_splats": 43}, 43), (15_000, {}, 40), (25_000, {}, 40)):
         table, strategy = Table(40), rules(**options)
         refine(table, strategy, step, gradient=1.0)
         assert len(table) == count
-
-
-def test_a_budget_below_the_start_is_told(capsys):
-    strategy = rules(budget=5)
-    strategy.verbose = True
-    strategy.begin(torch.zeros(3, 3), 5, 1)
-    assert capsys.readouterr().out == ""
-    strategy.begin(torch.zeros(3, 3), 6, 1)
-    assert "budget of error-guided is 5, but the training begins with 6" in " ".join(capsys.readouterr().out.split())

@@ -30,19 +30,6 @@ def test_copies_have_the_opacity_and_the_mass_of_the_one(opacity, copies):
         assert_close(torch.trapezoid(blended, x), torch.trapezoid(alone, x), rtol=5e-6, atol=0)
 
 
-def test_more_copies_than_the_limit_count_as_the_limit():
-    one = split_evenly(torch.tensor([0.5]), torch.ones(1, 3), torch.tensor([51]))
-    many = split_evenly(torch.tensor([0.5]), torch.ones(1, 3), torch.tensor([1000]))
-    assert torch.equal(one[0], many[0]) and torch.equal(one[1], many[1])
-
-
-def test_extreme_opacities_stay_finite():
-    opacities = torch.tensor([1e-30, 1e-8, 1.0 - 6e-8, 1.0])
-    each, scales = split_evenly(opacities, torch.ones(4, 3), torch.tensor([2, 51, 51, 51]))
-    assert torch.isfinite(scales).all() and (scales > 0).all()
-    assert ((each >= 0) & (each <= 1)).all()
-
-
 def test_noise_has_the_splats_shape_and_spares_what_is_visible():
     table = Table(3)
     table.splats["quats"].data = torch.randn(3, 4, generator=torch.Generator().manual_seed(1))
@@ -65,8 +52,6 @@ def test_noise_has_the_splats_shape_and_spares_what_is_visible():
 
 
 # What happens to the rows.
-
-
 def test_relocated_splats_become_copies_of_live_ones():
     table = Table(50)
     dead = torch.zeros(50, dtype=torch.bool)
@@ -93,12 +78,18 @@ def test_relocated_splats_become_copies_of_live_ones():
         assert state["exp_avg"][drawn].abs().max() == 0, "a drawn splat keeps its momentum"
 
 
-def test_nothing_alive_to_move_to():
+def test_extremes():
     table = Table(5)
     before = table.splats["latents"].detach().clone()
     source = relocate(table.splats, table.optimizers, torch.ones(5, dtype=torch.bool), 0.005)
     assert torch.equal(source, torch.arange(5))
     assert torch.equal(table.splats["latents"].detach(), before)
+    one, many = (split_evenly(torch.tensor([0.5]), torch.ones(1, 3), torch.tensor([count])) for count in (51, 1000))
+    assert torch.equal(one[0], many[0]) and torch.equal(one[1], many[1])
+    opacities = torch.tensor([1e-30, 1e-8, 1.0 - 6e-8, 1.0])
+    each, scales = split_evenly(opacities, torch.ones(4, 3), torch.tensor([2, 51, 51, 51]))
+    assert torch.isfinite(scales).all() and (scales > 0).all()
+    assert ((each >= 0) & (each <= 1)).all()
 
 
 def test_added_splats_are_copies_with_fresh_moments():

@@ -19,8 +19,6 @@ pytestmark = pytest.mark.usefixtures("no_cuda")
 
 
 # What happens to the rows.
-
-
 @pytest.mark.parametrize("name", STRATEGIES)
 def test_every_tensor_of_the_table_goes_along(name):
     """Small splats with large gradients are duplicated, large ones split, faint ones pruned or moved."""
@@ -69,8 +67,6 @@ def test_mcmc_rests_before_its_start_and_after_its_end():
 
 
 # Thresholds.
-
-
 def test_original_measures_by_the_cameras():
     """3DGS: 1.1 times the largest distance of a camera from the mean of all."""
     rules = strategy("original")
@@ -93,7 +89,12 @@ def test_original_grows_above_its_gradient(gradient, count):
 
 
 def test_original_keeps_its_calendar():
-    """No reset before the first step (gsplat 1.4 has one); a reset to 0.01 at 3000, refinement right away after it."""
+    for step, left in ((REFINES, 10), (3100, 9)):
+        table = Table(10)
+        table.splats["scales"].data[4] = torch.tensor(0.11).log()
+        table.step(strategy("original"), step)
+        assert len(table) == left
+    # No reset before the first step (gsplat 1.4 has one); a reset to 0.01 at 3000, refinement right away after it.
     table = Table(10, opacity=0.5)
     rules = strategy("original", images=500)
     table.step(rules, 0)
@@ -106,29 +107,16 @@ def test_original_keeps_its_calendar():
     assert len(table) == 20
 
 
-def test_original_prunes_large_splats_after_the_first_reset():
-    for step, left in ((REFINES, 10), (3100, 9)):
-        table = Table(10)
-        table.splats["scales"].data[4] = torch.tensor(0.11).log()
-        table.step(strategy("original"), step)
-        assert len(table) == left
-
-
 # The option on the command line.
-
-
-@pytest.mark.parametrize(
-    "text, config",
-    [
-        ("splatfacto", Splatfacto()),
-        ("original", Original()),
-        ("mcmc,budget=77,opacity-seen=base", Mcmc(budget=77, opacity_seen="base")),
-        (
-            "splatfacto,use_absgrad=False,densify_grad_thresh=4e-4",
-            Splatfacto(use_absgrad=False, densify_grad_thresh=4e-4),
-        ),
-    ],
-)
+@pytest.mark.parametrize("text, config", [
+    ("splatfacto", Splatfacto()),
+    ("original", Original()),
+    ("mcmc,budget=77,opacity-seen=base", Mcmc(budget=77, opacity_seen="base")),
+    (
+        "splatfacto,use_absgrad=False,densify_grad_thresh=4e-4",
+        Splatfacto(use_absgrad=False, densify_grad_thresh=4e-4),
+    ),
+])  # fmt: skip
 def test_a_word_is_a_strategy_with_its_options(text, config, tmp_path):
     assert strategy_from(text) == config == strategy_from(str(config))
     chosen = parse(["nrfgs", "--pipeline.model.densification", text, "--output-dir", str(tmp_path)])
@@ -136,20 +124,17 @@ def test_a_word_is_a_strategy_with_its_options(text, config, tmp_path):
     assert yaml.load(yaml.dump(chosen), Loader=yaml.Loader).pipeline.model.densification == config
 
 
-@pytest.mark.parametrize(
-    "text, says",
-    [
-        ("sparkle", "no strategy 'sparkle'; use one of splatfacto, original, mcmc"),
-        ("mcmc,sparkle=0.5", "mcmc has no option 'sparkle'; it has opacity_seen, .*budget"),
-        ("mcmc,budget=0", "budget is 0; it must be from 1 to"),
-        ("mcmc,budget=many", "budget is 'many'; it must be a whole number"),
-        ("original,opacity_seen=sparkle", "'sparkle'; use one of base, peak"),
-        ("splatfacto,use_absgrad=2", "use_absgrad is '2'; use one of true, false"),
-        ("splatfacto,densify_grad_thresh=nan", "densify_grad_thresh is nan; it must be zero or positive"),
-        ("splatfacto,cull_alpha_thresh=0.5", "cull_alpha_thresh is 0.5; it must be below 0.5"),
-        ("splatfacto,refine_every=0", "refine_every is 0; it must be at least 1"),
-    ],
-)
+@pytest.mark.parametrize("text, says", [
+    ("sparkle", "no strategy 'sparkle'; use one of splatfacto, original, mcmc"),
+    ("mcmc,sparkle=0.5", "mcmc has no option 'sparkle'; it has opacity_seen, .*budget"),
+    ("mcmc,budget=0", "budget is 0; it must be from 1 to"),
+    ("mcmc,budget=many", "budget is 'many'; it must be a whole number"),
+    ("original,opacity_seen=sparkle", "'sparkle'; use one of base, peak"),
+    ("splatfacto,use_absgrad=2", "use_absgrad is '2'; use one of true, false"),
+    ("splatfacto,densify_grad_thresh=nan", "densify_grad_thresh is nan; it must be zero or positive"),
+    ("splatfacto,cull_alpha_thresh=0.5", "cull_alpha_thresh is 0.5; it must be below 0.5"),
+    ("splatfacto,refine_every=0", "refine_every is 0; it must be at least 1"),
+])  # fmt: skip
 def test_options_that_cannot_work_are_refused(text, says):
     with pytest.raises(InputError, match=says):
         strategy_from(text)
@@ -180,8 +165,6 @@ def test_statistics_growth_and_resets_are_gsplats():
 
 
 # A budget of the gradient's rules.
-
-
 def simulated(rules, table: Table, steps: range, seed: int = 0) -> list[int]:
     """Refine a table at these steps; its gradients are drawn anew each time. Returns its sizes."""
     sizes = []

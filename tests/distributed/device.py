@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What devices do in the tests: `python device.py JOB WORLD SCENE FOLDER DEVICE_TYPE`.
-
-JOB is a function of `jobs.py`, run by a process for each of WORLD devices. Results are saved in FOLDER for the tests to
-look at.
-"""
+"""`python device.py JOB WORLD SCENE FOLDER DEVICE_TYPE` runs a function of `jobs.py` in a process for each of WORLD
+devices, which save their results in FOLDER for the tests to look at."""
 
 import sys
 from pathlib import Path
@@ -154,12 +151,7 @@ def statistics(model, info) -> dict:
 
 
 def train(scene: Path, out: Path, world: int, steps: int, load: Path | None = None, watch=None, **options):
-    """Train for some steps; the trainer.
-
-    Args:
-        load: folder of checkpoints to go on from.
-        watch: called with the trainer before it trains.
-    """
+    """The trainer after some steps, from a folder of checkpoints; `watch` is called with it before it trains."""
     more = {"--max-num-iterations": steps, **BUSY, **options, **({"--load-dir": load} if load else {})}
     trainer = trainer_of(scene, out, world, **more)
     if watch is not None:
@@ -180,7 +172,7 @@ def work(rank: int, job: str, world: int, scene: Path, folder: Path, device_type
     sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "helpers"))
     import device
     import jobs
-    from quick_start import keep_what_is_imported, let_go
+    from processes import keep_what_is_imported, let_go
 
     from nrfgs_lab.many_processes import join_group
 

@@ -125,11 +125,16 @@ def whole_after(devices: tuple[dict, dict], step: int) -> dict[str, torch.Tensor
     return {name: value.double() for name, value in rows.items()}
 
 
-def test_all_begin_anew_where_one_does(devices):
+def test_all_begin_anew_where_one_does_and_share_weights_and_exposures(devices):
     splats = [[len(after[f"{SPLATS}means"]) for after in device["after"]] for device in devices]
     assert set(splats[0]) == {150} and set(splats[1][:4]) == {150} and set(splats[1][4:]) != {150}
     assert devices[0]["counts"] == devices[1]["counts"] == [0, 0, 1, 2, 1, 2, 3, 4, 5, 6, 7, 8]
     assert "over the last 8 steps." in devices[0]["said"] and devices[1]["said"] == ""
+    first, second = (device["ended"] for device in devices)
+    assert all(torch.equal(value, second[name]) for name, value in first.items() if not name.startswith(SPLATS))
+    first, second = (device["exposures"] for device in devices)
+    assert torch.equal(first, second)
+    assert (first != 0).any() and first.mean(dim=0).abs().max() < 1e-6
 
 
 def test_the_trained_model_is_the_mean_of_the_whole(devices):
@@ -144,14 +149,6 @@ def test_the_trained_model_is_the_mean_of_the_whole(devices):
         )
         assert (mean - last).abs().max() > 1e-4, name
     assert "parameter_mean" not in saved(devices[0]["saved"][0], 11, "training")
-
-
-def test_shared_weights_and_exposures_are_the_same_on_all(devices):
-    first, second = (device["ended"] for device in devices)
-    assert all(torch.equal(value, second[name]) for name, value in first.items() if not name.startswith(SPLATS))
-    first, second = (device["exposures"] for device in devices)
-    assert torch.equal(first, second)
-    assert (first != 0).any() and first.mean(dim=0).abs().max() < 1e-6
 
 
 def test_a_checkpoint_in_between_has_the_mean_of_the_whole(devices):

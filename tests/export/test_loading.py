@@ -90,16 +90,13 @@ def camera(similarity: Similarity) -> Cameras:
     return Cameras(moved[None].float(), fx=60.0, fy=60.0, cx=24.0, cy=18.0, width=48, height=36)[0:1]
 
 
-@pytest.mark.parametrize(
-    "similarity",
-    [
-        Y_DOWN,
-        *(Similarity(random_rotation(seed), 3.0**seed, torch.randn(3, dtype=torch.float64)) for seed in (-1, 0, 1)),
-        # Half turns, where quaternions have no scalar part.
-        Similarity(torch.diag(torch.tensor([1.0, -1.0, -1.0]).double()), 1.0, torch.zeros(3).double()),
-        Similarity(torch.diag(torch.tensor([-1.0, -1.0, 1.0]).double()), 1.0, torch.zeros(3).double()),
-    ],
-)
+@pytest.mark.parametrize("similarity", [
+    Y_DOWN,
+    *(Similarity(random_rotation(seed), 3.0**seed, torch.randn(3, dtype=torch.float64)) for seed in (-1, 0, 1)),
+    # Half turns, where quaternions have no scalar part.
+    Similarity(torch.diag(torch.tensor([1.0, -1.0, -1.0]).double()), 1.0, torch.zeros(3).double()),
+    Similarity(torch.diag(torch.tensor([-1.0, -1.0, 1.0]).double()), 1.0, torch.zeros(3).double()),
+])  # fmt: skip
 def test_the_picture_is_the_same(similarity):
     background, original = torch.zeros(3), plain_splats(40)
     expected = render_splats(original, camera(NOWHERE), background)

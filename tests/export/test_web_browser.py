@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pages of `nrfgs export web` in real browsers, without a network and without a GPU.
-
-pip install -e '.[browser]'; apt-get install chromium firefox-esr xvfb; pytest -m browser tests/export
-"""
+"""Pages of `nrfgs export web` in real browsers, without a network and without a GPU:
+pip install -e '.[browser]'; apt-get install chromium firefox-esr xvfb; pytest -m browser tests/export"""
 
 import base64
 import io

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Trainings of a few steps: their command line, what they leave, and whether two are the same."""
 
+import json
 from copy import deepcopy
+from functools import cache
 from pathlib import Path
+from statistics import stdev
 from typing import Any
 
 import torch
@@ -39,15 +42,9 @@ LOUD = {
 
 
 def command_line(method: str, scene: Path, out: Path, steps: int, *options: dict[str, Any]) -> list[str]:
-    """Words after `ns-train` of a quiet training.
+    """Words after `ns-train` of a quiet training; `steps` include those before the checkpoint that it goes on from.
 
-    Args:
-        method: name of a registered method.
-        scene: folder of the data set.
-        out: folder for what the training writes.
-        steps: of the whole training, including those before the checkpoint that it goes on from.
-        options: values by option, dashes included; of several the last counts, and None takes the option away ("None"
-            is a value).
+    Options are values by option, dashes included; of several the last counts, and None takes the option away.
     """
     chosen = {"--data": scene, "--output-dir": out, "--max-num-iterations": steps, **QUIET}
     for more in options:
@@ -92,10 +89,8 @@ def checkpoint_of(config: Path) -> dict:
 
 def assert_same_training(one: dict, other: dict, rtol: float = 1e-5, atol: float = 1e-7) -> None:
     """Assert that two checkpoints have the same step and tensors: parameters, densification's counts, Adam's moments.
-
     A training that goes on from its checkpoint is the unbroken one: on the same machine both add the same numbers in
-    the same order, so that only a lost state can differ.
-    """
+    the same order, so that only a lost state can differ."""
     assert one["step"] == other["step"]
     for part in ("pipeline", "optimizers"):
         assert_close(tensors_of(one[part]), tensors_of(other[part]), rtol=rtol, atol=atol)
@@ -107,3 +102,31 @@ def tensors_of(tree: Any, prefix: str = "") -> dict[str, torch.Tensor]:
         return {prefix: tree}
     items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, (list, tuple)) else ()
     return {path: leaf for key, value in items for path, leaf in tensors_of(value, f"{prefix}/{key}").items()}
+
+
+# What trainings of 300 steps reach, from which bounds follow. results/smoke.json has, for each case, the PSNR of
+# trainings with several seeds, and that after one step.
+SMOKE_FILE = Path(__file__).resolve().parents[2] / "results" / "smoke.json"
+SMOKE_METHODS = "nrfgs", "nrfgs-sh", "nrfgs-vdgs", "nrfgs-gsnb", "nrfgs-sg"
+SMOKE_STEPS = 300
+PLAIN = {"--pipeline.model.num-downscales": 0, "--pipeline.model.few-views": "off", "--pipeline.model.shrinkage": 0}
+
+
+@cache
+def recorded() -> dict[str, dict[str, Any]]:
+    """Case -> "psnr" of its trainings by seed, and "after_one_step", which learns nothing."""
+    return json.loads(SMOKE_FILE.read_text(encoding="utf-8"))["records"]
+
+
+def bound(case: str) -> float:
+    """PSNR that a training of the case must exceed: four deviations below the least of those recorded. The deviation is
+    over seeds, the largest of the cases on the same data set."""
+    group = [one for name, one in recorded().items() if name.split("/")[0] == case.split("/")[0]]
+    return min(recorded()[case]["psnr"]) - 4 * max(stdev(one["psnr"]) for one in group)
+
+
+def gain_bound(scene: str) -> float:
+    """Decibels by which the field must be above harmonics on a capture: four deviations below the least recorded."""
+    field, harmonics = (recorded()[f"{scene}/{method}"]["psnr"] for method in ("nrfgs", "nrfgs-sh"))
+    gains = [ours - theirs for ours, theirs in zip(field, harmonics, strict=True)]
+    return min(gains) - 4 * stdev(gains)

@@ -1,10 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`Launcher`: when a compiled variant is launched again, and when Triton is asked anew, without a GPU."""
+"""`Launcher`: when a compiled variant is launched again, and when Triton is asked anew, without a GPU. All kernels."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
 
 pytest.importorskip("triton")
+
 from nrfgs_ns.kernels import launch as module
 from nrfgs_ns.kernels.launch import Launcher
 
@@ -82,3 +88,15 @@ def test_the_interpreter_and_old_tritons_are_asked_each_time(monkeypatch, old):
     for _ in range(2):
         launch((1, 1, 1), torch.zeros(8), 8, 0.5, **CONSTANTS)
     assert [kind for kind, *_ in kernel.launches] == ["triton", "triton"]
+
+
+# All kernels in Triton's interpreter (`*_interpreted.py` beside what they test), in one process of their own.
+TESTS = Path(__file__).parents[1]
+
+
+def test_kernels_in_the_interpreter():
+    files = sorted(set(TESTS.glob("*/*_interpreted.py")))
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *map(str, files)]
+    environment = {**os.environ, "TRITON_INTERPRET": "1", "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=TESTS.parent, timeout=580)
+    assert run.returncode == 0, run.stdout[-4000:] + run.stderr[-2000:]

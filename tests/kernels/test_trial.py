@@ -24,16 +24,13 @@ def raises(error: BaseException):
     return trial
 
 
-def test_an_outcome_is_remembered_and_a_failure_reported_once(caplog):
+def test_an_outcome_is_remembered_and_a_failure_reported_once(caplog, monkeypatch):
     gate = Gate("It")
     assert gate.find("sound", CPU, lambda: (1, 2)) == gate.find("sound", CPU, raises(OSError())) == (1, 2)
     for _ in range(2):
         assert not gate.opens("broken", CPU, raises(OSError("no compiler\nsearched everywhere")))
     assert gate["broken"] == "Triton's kernels do not run here (OSError: no compiler)"
     assert [record.getMessage() for record in caplog.records] == [f"It runs in plain PyTorch on cpu: {gate['broken']}."]
-
-
-def test_without_triton_nothing_is_tried(monkeypatch):
     monkeypatch.setattr(trial.importlib.util, "find_spec", lambda name: None)
     assert Gate("It").find("key", CPU, raises(AssertionError("tried"))) == "Triton is not installed"
 

@@ -10,13 +10,7 @@ from head_cases import assert_same, awake, scene
 from short_trainings import LOUD, command_line, trained
 from torch.testing import assert_close
 
-from nrfgs_lab.ablation import (
-    Inspect,
-    with_constant_distance,
-    without_high_branch,
-    without_low_branch,
-    without_opacity_residual,
-)
+from nrfgs_lab import ablation
 from nrfgs_ns.appearance.encoding import view_geometry
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NrfConfig
@@ -28,7 +22,7 @@ SPLIT = NrfConfig(latent_dim=8, hidden_width=16)
 
 def test_the_command(tiny_scene, tmp_path, capsys):
     config = trained(command_line("nrfgs", tiny_scene, tmp_path, 4, LOUD))
-    tyro.cli(Inspect, args=["--load-config", str(config), "--views", "2"]).main()
+    tyro.cli(ablation.Inspect, args=["--load-config", str(config), "--views", "2"]).main()
     result = json.loads((config.parent / "inspect.json").read_text())
     rows = {row["part"]: row for row in result["rows"]}
     assert {"high branch", "low branch", "opacity residual", "distance"} < set(rows)
@@ -38,7 +32,7 @@ def test_the_command(tiny_scene, tmp_path, capsys):
     assert result["together"]["loss_db"] <= 0.05 + 1e-6 and result["together"]["bytes"] <= rows["nothing"]["bytes"]
     assert "can be left out together" in capsys.readouterr().out
     with pytest.raises(InputError, match="0 of 2 test views"):
-        tyro.cli(Inspect, args=["--load-config", str(config), "--views", "0"]).main()
+        tyro.cli(ablation.Inspect, args=["--load-config", str(config), "--views", "0"]).main()
 
 
 def random_field(config: NrfConfig = SPLIT):
@@ -50,19 +44,19 @@ def random_field(config: NrfConfig = SPLIT):
 
 def test_parts_left_out_are_what_their_definition_says():
     whole, visible, centers = random_field()
-    small, shut = without_high_branch(whole), awake(SPLIT, torch.float32).requires_grad_(False)
+    small, shut = ablation.without_high_branch(whole), awake(SPLIT, torch.float32).requires_grad_(False)
     shut.load_state_dict(whole.head.state_dict())
     shut.high[2].weight[3], shut.high[2].bias[3] = 0.0, -1e4
     assert small.head.high is None and small.bytes < whole.bytes
     assert_same(small, Field(shut, whole.splats), visible, centers)
 
     seen = whole.head(whole.splats, visible, centers)
-    small = without_low_branch(whole)
+    small = ablation.without_low_branch(whole)
     parts = small.head.components(whole.splats, visible, centers)
     assert (parts["low branch"].values == 0).all() and parts["high branch"].values.abs().max() > 1e-3
     assert (small.head(whole.splats, visible, centers).opacities == seen.opacities).all()
 
-    found = without_opacity_residual(whole).head(whole.splats, visible, centers)
+    found = ablation.without_opacity_residual(whole).head(whole.splats, visible, centers)
     assert (found.opacities == whole.head.base_appearance(whole.splats, visible).opacities).all()
     assert_close(found.colors, seen.colors, rtol=0, atol=2e-5)
 
@@ -75,6 +69,6 @@ def test_a_constant_distance_is_what_the_field_sees(config):
     directions = torch.nn.functional.normalize(torch.randn(len(visible), 3), dim=-1)
     centers = field.splats["means"][visible] + 3.0 * directions
     _, log_distance = view_geometry(field.splats["means"][visible], centers, 0.01)
-    small = with_constant_distance(field, float(log_distance[0]))
+    small = ablation.with_constant_distance(field, float(log_distance[0]))
     assert not small.head.config.use_distance
     assert_same(small, field, visible, centers)

@@ -42,15 +42,12 @@ def compared(nrf, sh):
     return {NRF: {"eval": whole, "shine": field}, SH: {"eval": whole, "shine": {"views": sh}}}
 
 
-@pytest.mark.parametrize(
-    "nrf, sh, steps, says",
-    [
-        ([25.0, 25.2, 26.0], [24.0, 24.0, 24.9], ENOUGH_STEPS, "NRF is ahead of SH: +1.10 dB"),
-        ([25.0, 25.1, 25.1], [25.0, 25.0, 25.0], ENOUGH_STEPS, "No clear difference"),  # little
-        ([29.0, 21.0, 27.0], [25.0, 25.0, 25.0], ENOUGH_STEPS, "No clear difference"),  # the views disagree
-        ([25.0, 25.2, 26.0], [24.0, 24.0, 24.9], ENOUGH_STEPS - 1, "Too short for a verdict"),
-    ],
-)
+@pytest.mark.parametrize("nrf, sh, steps, says", [
+    ([25.0, 25.2, 26.0], [24.0, 24.0, 24.9], ENOUGH_STEPS, "NRF is ahead of SH: +1.10 dB"),
+    ([25.0, 25.1, 25.1], [25.0, 25.0, 25.0], ENOUGH_STEPS, "No clear difference"),  # little
+    ([29.0, 21.0, 27.0], [25.0, 25.0, 25.0], ENOUGH_STEPS, "No clear difference"),  # the views disagree
+    ([25.0, 25.2, 26.0], [24.0, 24.0, 24.9], ENOUGH_STEPS - 1, "Too short for a verdict"),
+])  # fmt: skip
 def test_the_verdict_follows_the_measurement(nrf, sh, steps, says):
     assert verdict(compared(nrf, sh), steps).startswith(says)
 

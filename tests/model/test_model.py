@@ -19,9 +19,21 @@ from pytorch_msssim import SSIM
 from torch.testing import assert_close
 
 from nrfgs_lab.training_run import parse
+from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.head import SplatAppearance
+from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.model.model import NrfgsModel
-from nrfgs_ns.model.renderer import Pinholes, pinhole, world_to_camera
+from nrfgs_ns.model.renderer import (
+    Pinhole,
+    Pinholes,
+    composite_view,
+    pinhole,
+    project_view,
+    projection_options,
+    world_to_camera,
+)
 from nrfgs_ns.model.warmup import warm_up
+from nrfgs_ns.rasterizer import composite
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -124,11 +136,18 @@ def test_training_resolution_follows_the_schedule(build):
         assert torch.isfinite(pipeline.model.get_loss_dict(outputs, batch)["main_loss"])
 
 
-def test_intrinsics_shrink_with_the_image():
+def test_intrinsics_shrink_with_the_image_and_poses_are_inverted_with_y_and_z_flipped():
     camera = Cameras(torch.eye(4)[None, :3], fx=100.0, fy=90.0, cx=50.0, cy=31.0, width=101, height=63)[0:1]
     seen_from = pinhole(camera, camera.camera_to_worlds, 2)
     assert (seen_from.width, seen_from.height) == (50, 31)
     assert_close(seen_from.K[0], torch.tensor([[50.0, 0, 25], [0, 45, 15.5], [0, 0, 1]]))
+    rotation = torch.linalg.qr(torch.randn(3, 3))[0]
+    pose = torch.cat([rotation, torch.randn(3, 1)], dim=1)[None]
+    matrix = world_to_camera(pose)[0]
+    ahead = pose[0, :, 3] - 2 * rotation[:, 2]  # nerfstudio looks along -z
+    assert_close(matrix @ torch.cat([ahead, torch.ones(1)]), torch.tensor([0.0, 0, 2, 1]), atol=1e-5, rtol=0)
+    above = pose[0, :, 3] + rotation[:, 1]
+    assert_close(matrix @ torch.cat([above, torch.ones(1)]), torch.tensor([0.0, -1, 0, 1]), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("batched", [True, False])
@@ -150,16 +169,6 @@ def test_a_camera_on_the_gpu_is_asked_once_until_it_is_written_to():
     assert pinholes.fixed(camera, gpu) is first
     camera.camera_to_worlds[0, 0, 3] = 7.0
     assert pinholes.fixed(camera, gpu).center.tolist() == [7.0, 0.0, 0.0]
-
-
-def test_world_to_camera_inverts_the_pose_and_flips_y_and_z():
-    rotation = torch.linalg.qr(torch.randn(3, 3))[0]
-    pose = torch.cat([rotation, torch.randn(3, 1)], dim=1)[None]
-    matrix = world_to_camera(pose)[0]
-    ahead = pose[0, :, 3] - 2 * rotation[:, 2]  # nerfstudio looks along -z
-    assert_close(matrix @ torch.cat([ahead, torch.ones(1)]), torch.tensor([0.0, 0, 2, 1]), atol=1e-5, rtol=0)
-    above = pose[0, :, 3] + rotation[:, 1]
-    assert_close(matrix @ torch.cat([above, torch.ones(1)]), torch.tensor([0.0, -1, 0, 1]), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5])
@@ -253,3 +262,74 @@ def test_training_starts_with_one_warm_up_step_per_view_or_as_many_as_asked(buil
     for step in range(3):
         first.run_callback_at_location(step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
     assert taken == [steps], "once, before step 0"
+
+
+# Where an image comes from: composited colours, or a head at the pixel that turns composited features into one.
+BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
+
+
+def turned_camera(dtype=torch.float32) -> Pinhole:
+    """A camera of 9 x 7 pixels at (0.3, -0.2, 4) that looks a little past the origin, with unequal focal lengths."""
+    axis = torch.tensor([[0, -0.2, 0.1], [0.2, 0, -0.05], [-0.1, 0.05, 0]], dtype=torch.float64)
+    turn = torch.linalg.matrix_exp(axis).to(dtype)
+    center = torch.tensor([0.3, -0.2, 4.0], dtype=dtype)
+    K = torch.tensor([[[8.0, 0, 4.2], [0, 9.0, 3.1], [0, 0, 1]]], dtype=dtype)
+    return Pinhole(world_to_camera(torch.cat([turn, center[:, None]], dim=1)[None]), K, 9, 7, center)
+
+
+def table(means: torch.Tensor, **more: torch.Tensor) -> dict[str, torch.Tensor]:
+    count = len(means)
+    quats = torch.linspace(-1, 1, 4 * count, dtype=means.dtype).view(count, 4).cos()
+    scales = torch.linspace(-1.5, -0.5, 3 * count, dtype=means.dtype).view(count, 3)
+    return {"means": means, "quats": quats, "scales": scales, "opacities": torch.ones_like(means[:, :1]), **more}
+
+
+def test_a_ray_leads_to_its_pixel():
+    camera = turned_camera(torch.float64)
+    rays = camera.rays()
+    assert_close(rays.norm(dim=-1), torch.ones(7, 9, dtype=torch.float64))
+    distances = torch.linspace(1, 3, 63, dtype=torch.float64)[:, None]
+    view = project_view(table(camera.center + distances * rays.view(63, 3)), camera, projection_options("classic", 1.0))
+    rows, columns = torch.meshgrid(torch.arange(7), torch.arange(9), indexing="ij")
+    centers = torch.stack([columns, rows], dim=-1).view(63, 2) + 0.5
+    assert len(view.visible) == 63
+    assert_close(view.projection.means2d, centers.double())
+
+
+@pytest.mark.parametrize("with_depth", [False, True])
+def test_without_a_head_at_the_pixel_the_image_is_what_the_rasterizer_blends(with_depth):
+    """To the bit."""
+    torch.manual_seed(0)
+    head = ShConfig(degree=1).setup()
+    splats = table(torch.randn(6, 3), **head.splat_params(torch.rand(6, 3)))
+    view = project_view(splats, turned_camera(), projection_options("classic", 1.0))
+    appearance = Field(head, splats).seen_from(view)
+    outputs, _ = composite_view(view, appearance, BACKGROUND, with_depth=with_depth)
+    render, alpha, _ = composite(view.projection, *appearance, backgrounds=BACKGROUND[None], with_depth=with_depth)
+    assert torch.equal(outputs["rgb"], render[0, ..., :3].clamp(0, 1)) and torch.equal(
+        outputs["accumulation"], alpha[0]
+    )
+    assert len(view.visible) > 3 and outputs["rgb"].std() > 0.05
+    if with_depth:
+        assert torch.equal(outputs["depth"][alpha[0] > 0], render[0, ..., 3:][alpha[0] > 0])
+
+
+def test_the_image_of_features_is_drawn_over_the_background_and_then_exposed():
+    torch.manual_seed(0)
+    splats, camera = table(torch.randn(6, 3)), turned_camera()
+    view = project_view(splats, camera, projection_options("classic", 1.0))
+    features = torch.rand(len(view.visible), 5)
+    appearance = SplatAppearance(features, torch.full((len(features),), 0.6))
+    seen = []
+
+    def image_of(composited, rays):
+        seen.append((composited, rays))
+        return composited[..., 1:4] + 0.1 * rays
+
+    drawn, _ = composite_view(view, appearance, BACKGROUND, image_of=image_of, look=lambda rgb: 0.5 * rgb)
+    ((composited, rays),) = seen
+    blended, alpha, _ = composite(view.projection, *appearance)
+    assert torch.equal(composited, blended[0]) and torch.equal(rays, camera.rays())
+    image = alpha[0] * (composited[..., 1:4] + 0.1 * rays) + (1 - alpha[0]) * BACKGROUND
+    assert_close(drawn["rgb"], 0.5 * image)
+    assert 0.1 < alpha.mean() < 0.9 and drawn["depth"].shape == (7, 9, 1)

@@ -50,7 +50,7 @@ def moved_by(noise: ViewNoise, splats: dict[str, torch.Tensor], step: int):
     return noise.moved(splats, noise.generator(splats["means"].device, step))
 
 
-def test_noise_has_the_length_that_was_asked_for_and_moves_nothing_else():
+def test_noise_has_its_length_moves_nothing_else_and_is_the_steps_and_the_seeds_alone():
     splats = {"means": torch.zeros(20_000, 3, requires_grad=True), "latents": torch.ones(20_000, 4)}
     moved = moved_by(ViewNoise(0.3, 42), splats, 7)
     assert moved["means"].square().sum(dim=-1).mean().sqrt().item() == pytest.approx(0.3, rel=0.02)
@@ -58,9 +58,6 @@ def test_noise_has_the_length_that_was_asked_for_and_moves_nothing_else():
     assert moved["latents"] is splats["latents"] and not splats["means"].any()
     assert (torch.autograd.grad(moved["means"].sum(), splats["means"])[0] == 1).all()
     assert moved_by(ViewNoise(0.0, 42), splats, 7) is splats
-
-
-def test_noise_is_the_steps_and_the_seeds_alone():
     splats = {"means": torch.zeros(500, 3)}
     noise = ViewNoise(1.0, 42)
     state = torch.get_rng_state()

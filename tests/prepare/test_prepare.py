@@ -35,7 +35,6 @@ def three(tmp_path) -> Path:
 
 
 # Two textured walls, one before the other, seen by cameras that step sideways and turn a little.
-
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
 
 
@@ -124,8 +123,6 @@ def check_walk(poses: np.ndarray) -> None:
 
 
 # The whole way, in small.
-
-
 def test_recovered_cameras_are_those_that_rendered(prepared):
     meta, poses = frames_of(prepared)
     for i, frame in enumerate(meta["frames"]):
@@ -220,8 +217,6 @@ def test_interrupted_features_are_taken_up(walls, tmp_path, monkeypatch):
 
 
 # Advice where it fails.
-
-
 def test_photographs_that_show_nothing_in_common_are_told(tmp_path):
     for i in range(3):
         photo(tmp_path / "photos" / f"{i}.png", (120, 90), ("red", "green", "blue")[i])
@@ -242,17 +237,14 @@ def test_global_mapping_helps_out_and_finds_the_same(prepared, walls, tmp_path, 
     check_walk(frames_of(out)[1])
 
 
-@pytest.mark.parametrize(
-    ("make", "said"),
-    [
-        (lambda d: None, "no such folder"),
-        (lambda d: photo(d / "more" / "a.jpg"), "directly holds 0 photographs"),
-        (lambda d: (d.mkdir(), (d / "a.mp4").touch()), "name that file itself"),
-        (lambda d: [photo(d / "a.jpg"), (d / "b.HEIC").touch()], "b.HEIC is .*: run `pip install pillow-heif`"),
-        (lambda d: (photo(d / "images" / "a.jpg"), (d / "transforms.json").touch()), "scene already.*ns-train nrfgs"),
-        (lambda d: d.write_text("no video"), "neither a folder of photographs nor a video"),
-    ],
-)
+@pytest.mark.parametrize(("make", "said"), [
+    (lambda d: None, "no such folder"),
+    (lambda d: photo(d / "more" / "a.jpg"), "directly holds 0 photographs"),
+    (lambda d: (d.mkdir(), (d / "a.mp4").touch()), "name that file itself"),
+    (lambda d: [photo(d / "a.jpg"), (d / "b.HEIC").touch()], "b.HEIC is .*: run `pip install pillow-heif`"),
+    (lambda d: (photo(d / "images" / "a.jpg"), (d / "transforms.json").touch()), "scene already.*ns-train nrfgs"),
+    (lambda d: d.write_text("no video"), "neither a folder of photographs nor a video"),
+])  # fmt: skip
 def test_inputs_that_cannot_do_are_refused(make, said, tmp_path, no_heif):
     make(tmp_path / "in")
     with pytest.raises(InputError, match=said):
@@ -291,14 +283,11 @@ def test_what_is_refused_before_any_work(three, tmp_path, monkeypatch):
         Run(Prepare(three, tmp_path / "out"))
 
 
-@pytest.mark.parametrize(
-    ("file", "content", "said"),
-    [
-        ("state.json", "[1, 2]", "state.json is damaged"),
-        ("state.json", "{", "state.json is damaged"),
-        ("database.db", "no database", "COLMAP stops with"),
-    ],
-)
+@pytest.mark.parametrize(("file", "content", "said"), [
+    ("state.json", "[1, 2]", "state.json is damaged"),
+    ("state.json", "{", "state.json is damaged"),
+    ("database.db", "no database", "COLMAP stops with"),
+])  # fmt: skip
 def test_damaged_work_is_told_in_one_sentence(prepared, walls, tmp_path, file, content, said):
     out = tmp_path / "scene"
     shutil.copytree(prepared, out)
@@ -332,8 +321,6 @@ def test_what_colmap_could_not_write_whole_is_not_built_on(prepared, tmp_path, m
 
 
 # Collecting.
-
-
 def test_photographs_are_kept_or_made_upright(tmp_path):
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation], exif[ExifTags.Base.Model] = 6, "Camera"
@@ -382,38 +369,32 @@ def test_a_photograph_that_colmap_leaves_out_is_named(tmp_path):
         structure.extract_features(database, tmp_path, both, lambda _: None, "SIMPLE_RADIAL", True, 1600, 100)
 
 
-def test_names_stay_different_and_short():
+def test_names_stay_different_and_one_camera_needs_all_to_agree_with_damaged_exif_as_none(tmp_path):
     given = ["00002_a_b.jpg", "a b.jpg", "a_b.jpg", "a_b.jpeg", "\udcff.jpg"]
     given += [f"{letters}.jpg" for letters in ("ä" * 100, "ö" * 100, "x" * 250)]
     names = photos.stored_names([Path(name) for name in given])
     assert len(set(names)) == len(given)
     assert all(name.isascii() and len(name) < 150 and "?" not in name for name in names)
-
-
-EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 50 50\nshowpage\n"
-
-
-@pytest.mark.parametrize(
-    ("make", "said"),
-    [
-        (lambda path: path.write_bytes(EPS), "not a readable image"),
-        (lambda path: Image.new("RGB", (1, 3000)).save(path), "1 x 3000 pixels"),
-        (lambda path: Image.new("I;16", (40, 30)).save(path), "more than 8 bits"),
-        (lambda path: path.write_bytes(path.read_bytes()[:-40]), "cannot be decoded"),
-    ],
-)
-def test_what_is_no_photograph_is_named(three, tmp_path, make, said):
-    make(three / "1.png")
-    with pytest.raises(InputError, match=f"1.png.*{said}"):
-        Run(Prepare(three, tmp_path / "out"), Console(quiet=True)).import_input()
-
-
-def test_one_camera_only_where_everything_agrees_and_damaged_exif_is_none(tmp_path):
     exif = b"Exif\0\0II*\0\x08\0\0\0\xff\xff" + bytes(range(200))
     paths = [photo(tmp_path / "in" / f"{i}.jpg", size, exif=exif) for i, size in enumerate([(40, 30)] * 2 + [(30, 40)])]
     photos.import_photos(paths, tmp_path / "stored", lambda _: None)
     assert photos.same_camera(tmp_path / "stored", ["0.jpg", "1.jpg"])
     assert not photos.same_camera(tmp_path / "stored", ["0.jpg", "2.jpg"])
+
+
+EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 50 50\nshowpage\n"
+
+
+@pytest.mark.parametrize(("make", "said"), [
+    (lambda path: path.write_bytes(EPS), "not a readable image"),
+    (lambda path: Image.new("RGB", (1, 3000)).save(path), "1 x 3000 pixels"),
+    (lambda path: Image.new("I;16", (40, 30)).save(path), "more than 8 bits"),
+    (lambda path: path.write_bytes(path.read_bytes()[:-40]), "cannot be decoded"),
+])  # fmt: skip
+def test_what_is_no_photograph_is_named(three, tmp_path, make, said):
+    make(three / "1.png")
+    with pytest.raises(InputError, match=f"1.png.*{said}"):
+        Run(Prepare(three, tmp_path / "out"), Console(quiet=True)).import_input()
 
 
 def test_the_sharpest_frame_of_each_piece_of_a_video_is_taken(tmp_path):
@@ -435,8 +416,6 @@ def test_the_sharpest_frame_of_each_piece_of_a_video_is_taken(tmp_path):
 
 
 # The whole way, on real photographs.
-
-
 @pytest.mark.slow
 def test_a_real_capture_is_recovered(captures, tmp_path):
     """Every second photograph of `fox` at two thirds of its size, against the poses that the capture came with."""

@@ -18,15 +18,10 @@ def rasterization(
     absgrad: bool = False,
     **options: Any,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """`project`, then `composite`.
+    """`project`, then `composite`, of gsplat's nine arguments; options are fields of `ProjectionOptions`.
 
-    Args:
-        arguments: gsplat's nine: means, quats, scales, opacities [N], colors [N, D] or, per camera, [C, N, D],
-            viewmats, Ks, width, height.
-        packed: False gives `info` gsplat's dense layout: radii, means2d, depths, conics and opacities with leading
-            dimensions [C, N] and zeros where a splat is not visible; camera_ids and gaussian_ids are None.
-        render_mode: "RGB" or "RGB+ED".
-        options: fields of `ProjectionOptions`.
+    packed False gives `info` gsplat's dense layout: radii, means2d, depths, conics and opacities with leading
+    dimensions [C, N] and zeros where a splat is not visible; camera_ids and gaussian_ids are None.
     """
     means, quats, scales, opacities, colors, viewmats, Ks, width, height = arguments
     n, c = len(means), len(viewmats)

@@ -158,9 +158,7 @@ def composite(
     """Blend N splats into one image.
 
     Args:
-        colors: [N, D]
         opacities: as composited, compensation included. [N]
-        background: [D]
         unit: rounding unit of the arithmetic that will be compared (float32 by default); it shapes `rounding`,
             `undecided` and `jump` only, never the image.
         opacity_error: relative error of the opacities beyond rounding, in the same role. [N]
@@ -245,12 +243,10 @@ def rasterization(
     """The twin of `gsplat_call.rasterization`, camera by camera.
 
     Args:
-        arguments: gsplat's nine, from means to height.
         perturb: applied to the projected means, depths, conics and compensations, to pixels' offsets and their products
             (`HELD`), and to the transmittance that expected depth is divided by; with noise of a few rounding units it
             shows what rounding does to the image and to its gradients.
         orders: see `composite`; one per camera.
-        limits: near_plane, far_plane, eps2d, floor, bounds.
 
     Returns:
         render [C, H, W, X], alphas [C, H, W, 1], and the screens and images of the C cameras.

@@ -62,10 +62,7 @@ def drawn_in(of: Splats, column: int, row: int, side: int) -> tuple[Tensor, Tens
 
 def assert_lists(begins: Tensor, rows: Tensor, of: Splats, width: int, height: int, side: int) -> int:
     """Each tile lists what draws in it, nothing outside of the boxes, near before far, ties in the table's order.
-
-    Returns:
-        How many splats are listed in tiles in which no pixel of theirs reaches 1/255.
-    """
+    Returns how many splats are listed in tiles in which no pixel of theirs reaches 1/255."""
     assert begins.shape == (1, height + 1, width) and begins.dtype == rows.dtype == torch.int32
     starts, listed, spare = [*begins.flatten().tolist(), len(rows)], rows.tolist(), 0
     for tile in range(width * height):

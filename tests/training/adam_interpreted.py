@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Adam's kernel in Triton's interpreter against torch's Adam.
-
-Run by kernels/test_interpreted.py.
-"""
+"""Adam's kernel in Triton's interpreter against torch's Adam."""
 
 from copy import deepcopy
 

@@ -81,8 +81,7 @@ def a_step(model, optimizers):
 
 
 @pytest.mark.parametrize(
-    "change, anew",
-    [(relocated, True), (reset, True), (removed, True), (noise, False), (a_step, False)],
+    "change, anew", [(relocated, True), (reset, True), (removed, True), (noise, False), (a_step, False)]
 )
 def test_what_gives_rows_another_meaning_begins_anew(change, anew, trainer):
     """The real changes on a real model."""

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checkpoint files: whole or not there, and never another model in silence."""
 
+import contextlib
 import os
 import random
 import signal
@@ -73,7 +74,7 @@ def test_a_damaged_newest_falls_back_to_the_one_before(tmp_path, capsys):
         read_latest(tmp_path)
 
 
-def test_code_in_a_checkpoint_is_not_run(tmp_path):
+def test_code_in_a_checkpoint_is_not_run_and_what_is_not_there_is_refused(tmp_path):
     class Attack:
         def __reduce__(self):
             return os.mkdir, (str(tmp_path / "owned"),)
@@ -82,9 +83,6 @@ def test_code_in_a_checkpoint_is_not_run(tmp_path):
     with pytest.raises(Damaged):
         read(tmp_path / "step-000000001.ckpt")
     assert not (tmp_path / "owned").exists()
-
-
-def test_a_step_that_is_not_there_and_a_folder_in_place_of_a_file_are_refused(tmp_path):
     write(tmp_path, 1, content(1))
     with pytest.raises(InputError, match="no checkpoint of step 5, only of 1"):
         read_latest(tmp_path, step=5)
@@ -162,44 +160,30 @@ def scene(names=("a.png", "b.png", "c.png"), shift: float = 0.0) -> dict:
     return scene_of(list(names), SimpleNamespace(camera_to_worlds=poses))
 
 
-@pytest.mark.parametrize(
-    ("here", "message"),
-    [
-        (scene(("a.png", "x.png", "c.png")), r"other images \(b.png, x.png\)"),
-        (scene(("a.png", "b.png")), r"other images \(c.png\)"),
-        (scene(shift=0.1), r"other poses \(b.png elsewhere\)"),
-    ],
-)
+@pytest.mark.parametrize(("here", "message"), [
+    (scene(("a.png", "x.png", "c.png")), r"other images \(b.png, x.png\)"),
+    (scene(("a.png", "b.png")), r"other images \(c.png\)"),
+    (scene(shift=0.1), r"other poses \(b.png elsewhere\)"),
+])  # fmt: skip
 def test_another_scene_is_refused(here, message):
     check_scene(scene(), scene(shift=1e-4), "elsewhere")
     with pytest.raises(InputError, match=message):
         check_scene(scene(), here, "data/fox")
 
 
-@pytest.mark.parametrize(
-    "name, value",
-    [
-        ("pipeline.model.appearance.num_bands", 2),
-        ("pipeline.model.rasterize_mode", "antialiased"),
-        ("pipeline.datamanager.dataparser.scale_factor", 2.0),
-        ("pipeline.datamanager.camera_res_scale_factor", 0.5),
-    ],
-)
-def test_an_option_that_changes_the_meaning_is_refused(name, value):
-    with pytest.raises(InputError, match="--" + name.replace("_", "-") + " was .* and is "):
+@pytest.mark.parametrize("name, value, may_change", [
+    ("pipeline.model.appearance.num_bands", 2, False),
+    ("pipeline.model.rasterize_mode", "antialiased", False),
+    ("pipeline.datamanager.dataparser.scale_factor", 2.0, False),
+    ("pipeline.datamanager.camera_res_scale_factor", 0.5, False),
+    ("optimizers.means.optimizer.lr", 1e-5, True),
+    ("max_num_iterations", 600, True),
+    ("pipeline.model.densification.refine_every", 50, True),
+    ("pipeline.datamanager.cache_images", "cpu", True),
+    ("pipeline.model.appearance.implementation", "torch", True),
+    ("pipeline.datamanager.dataparser.data", "elsewhere", True),
+])  # fmt: skip
+def test_an_option_that_changes_the_meaning_is_refused(name, value, may_change):
+    says = pytest.raises(InputError, match="--" + name.replace("_", "-") + " was .* and is ")
+    with contextlib.nullcontext() if may_change else says:
         check_options(options_of(nrfgs.config), options_of(config_with(name, value)))
-
-
-@pytest.mark.parametrize(
-    "name, value",
-    [
-        ("optimizers.means.optimizer.lr", 1e-5),
-        ("max_num_iterations", 600),
-        ("pipeline.model.densification.refine_every", 50),
-        ("pipeline.datamanager.cache_images", "cpu"),
-        ("pipeline.model.appearance.implementation", "torch"),
-        ("pipeline.datamanager.dataparser.data", "elsewhere"),
-    ],
-)
-def test_options_of_learning_may_change_and_so_may_places(name, value):
-    check_options(options_of(nrfgs.config), options_of(config_with(name, value)))

@@ -184,49 +184,43 @@ def test_a_finished_training_says_so_and_how_to_extend_it(finished, tiny_scene, 
     assert max(find(longer.checkpoint_dir)) == STEPS + 1
 
 
-@pytest.mark.parametrize(
-    ("option", "bad"),
-    [
-        ("max_num_iterations", -1),
-        ("pipeline.model.view_noise", math.inf),
-        ("pipeline.model.ssim_lambda", math.nan),
-        ("pipeline.model.resolution_schedule", 0),
-        ("pipeline.model.robust_loss", 2.0),
-        ("pipeline.datamanager.camera_res_scale_factor", 0),
-        ("logging.steps_per_log", 0),
-        ("load_step", 5),
-        ("time_budget", 0),
-        ("time_budget", math.nan),
-        ("schedule_steps", -5),
-        ("machine.num_devices", 0),
-        ("optimizers.quats.optimizer.lr", -1.0),
-        ("optimizers.means.optimizer.lr", 0.0),
-        ("optimizers.quats.optimizer.lr", 1e30),
-        ("optimizers.means.scheduler.lr_final", 0.0),
-        ("mixed_precision", True),
-        ("gradient_accumulation_steps", {"means": 2}),
-    ],
-)
+@pytest.mark.parametrize(("option", "bad"), [
+    ("max_num_iterations", -1),
+    ("pipeline.model.view_noise", math.inf),
+    ("pipeline.model.ssim_lambda", math.nan),
+    ("pipeline.model.resolution_schedule", 0),
+    ("pipeline.model.robust_loss", 2.0),
+    ("pipeline.datamanager.camera_res_scale_factor", 0),
+    ("logging.steps_per_log", 0),
+    ("load_step", 5),
+    ("time_budget", 0),
+    ("time_budget", math.nan),
+    ("schedule_steps", -5),
+    ("machine.num_devices", 0),
+    ("optimizers.quats.optimizer.lr", -1.0),
+    ("optimizers.means.optimizer.lr", 0.0),
+    ("optimizers.quats.optimizer.lr", 1e30),
+    ("optimizers.means.scheduler.lr_final", 0.0),
+    ("mixed_precision", True),
+    ("gradient_accumulation_steps", {"means": 2}),
+])  # fmt: skip
 def test_options_without_sense_are_refused(option, bad, tiny_scene):
     config = replace(config_with(option, bad), data=tiny_scene)
     with pytest.raises(InputError, match=re.escape(f"{option} is {bad}")):
         config.print_to_terminal()  # ns-train's first call: nothing is written before it
 
 
-def test_a_folder_beyond_the_systems_encoding_is_refused(tiny_scene, tmp_path):
+def test_a_folder_beyond_the_systems_encoding_and_images_too_small_to_begin_with_are_refused(tiny_scene, tmp_path):
     config = parse(command_line("nrfgs", tiny_scene, tmp_path / os.fsdecode(b"caf\xe9"), STEPS))
     with pytest.raises(InputError, match="beyond this system's encoding. Set PYTHONUTF8=1"):
         config.print_to_terminal()
-
-
-def test_images_too_small_to_begin_with_are_refused(tiny_scene, tmp_path):
     with pytest.raises(InputError, match="1 x 1 pixels.*--pipeline.model.num-downscales"):
         ready(tiny_scene, tmp_path, {"--pipeline.model.num-downscales": 5})
     with pytest.raises(InputError, match="0.01 leaves nothing"):
         ready(tiny_scene, tmp_path, {"--pipeline.datamanager.camera-res-scale-factor": 0.01})
 
 
-def test_another_scene_and_other_options_are_refused(finished, tiny_scene, tmp_path):
+def test_another_scene_other_options_and_another_method_are_refused(finished, tiny_scene, tmp_path):
     from nrfgs_lab.scenes import SceneConfig, write_scene
 
     other = write_scene(SceneConfig(views=10, width=48, height=36, points=300, samples=1, seed=5), tmp_path / "other")
@@ -235,9 +229,6 @@ def test_another_scene_and_other_options_are_refused(finished, tiny_scene, tmp_p
         ready(other, tmp_path / "b", resumed, steps=STEPS + 2)
     with pytest.raises(InputError, match="--pipeline.model.appearance.color-scale was 0.2 and is 0.3"):
         ready(tiny_scene, tmp_path / "c", resumed, {"--pipeline.model.appearance.color-scale": 0.3}, steps=STEPS + 2)
-
-
-def test_a_checkpoint_of_nerfstudios_own_method_is_refused(tiny_scene, tmp_path):
     own = {"step": 9, "pipeline": {"_model.gauss_params.means": torch.zeros(3, 3)}, "optimizers": {}, "schedulers": {}}
     torch.save(own, tmp_path / "step-000000009.ckpt")
     with pytest.raises(InputError, match="of another method"):
@@ -271,8 +262,6 @@ def test_what_ns_train_says_before_it_begins(tiny_scene, tmp_path, monkeypatch, 
 
 
 # Signals and states, without a training.
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_is_a_request_and_handlers_are_given_back(number, capfd):
     request, before = StopRequest(), signal.getsignal(number)

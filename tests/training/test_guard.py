@@ -88,8 +88,7 @@ def state_of(trainer) -> dict:
 
 
 @pytest.mark.parametrize(
-    ("fused", "name", "value"),
-    [(False, "loss", NAN), (True, "means", NAN), (True, "scales", 1e19)],
+    ("fused", "name", "value"), [(False, "loss", NAN), (True, "means", NAN), (True, "scales", 1e19)]
 )
 def test_a_condemned_step_leaves_parameters_and_moments_as_they_were(start, fused, name, value):
     trainer = start(fused=fused)

@@ -2,7 +2,9 @@
 """Train, evaluate, render, resume, refuse: nerfstudio's own commands on a tiny scene, with CUDA out of reach."""
 
 import functools
+import io
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -10,6 +12,7 @@ import torch
 from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.render import DatasetRender
 from nerfstudio.utils.eval_utils import eval_setup
+from rich.console import Console
 from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
 from torch.testing import assert_close
 
@@ -17,7 +20,7 @@ from nrfgs_lab.training_run import evaluate
 from nrfgs_ns.appearance import gsnb, sg
 from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.training import trainer_config
+from nrfgs_ns.training import progress
 from nrfgs_ns.training.checkpoint_files import read_latest
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -40,6 +43,8 @@ METHODS = {
     "nrfgs-vdgs": (48, 524_288 + 1729, ["field"]),
     "nrfgs-gsnb": (48, 7760, ["features_rest", "field"]),
     "nrfgs-sg": (24, 0, ["sg_axes", "sg_sharpness", "sg_colors"]),
+    "nrfgs-deferred": (16, 38_787, ["features", "field"]),
+    "nrfgs-latent-spec": (15, 28_167, ["features", "field"]),
 }
 """Of each method: colour numbers per splat, shared weights, and groups of parameters that its head adds."""
 
@@ -137,15 +142,12 @@ def test_learning_rates_of_the_command_count_where_a_training_goes_on(finished, 
     assert groups["quats"]["eps"] == 1e-9
 
 
-@pytest.mark.parametrize(
-    "method, more, says",
-    [
-        ("nrfgs-sh", {}, "written by the 'nrf' head"),
-        ("nrfgs", {"--pipeline.model.appearance.latent-dim": 8}, "latents"),
-        ("nrfgs", {"--pipeline.model.appearance.hidden-width": 32}, "head.low"),
-        ("nrfgs", {"--pipeline.model.appearance.split-bands": False}, "head."),
-    ],
-)
+@pytest.mark.parametrize("method, more, says", [
+    ("nrfgs-sh", {}, "written by the 'nrf' head"),
+    ("nrfgs", {"--pipeline.model.appearance.latent-dim": 8}, "latents"),
+    ("nrfgs", {"--pipeline.model.appearance.hidden-width": 32}, "head.low"),
+    ("nrfgs", {"--pipeline.model.appearance.split-bands": False}, "head."),
+])  # fmt: skip
 def test_checkpoint_of_another_head_is_refused(method, more, says, finished, tiny_scene, tmp_path):
     args = options(tiny_scene, tmp_path, method, {"--load-dir": models_of(finished("nrfgs"))}, more)
     with pytest.raises(InputError, match=says) as error:
@@ -153,13 +155,25 @@ def test_checkpoint_of_another_head_is_refused(method, more, says, finished, tin
     assert "--load-config" in str(error.value)
 
 
-def test_the_size_of_large_or_smaller_photographs_is_said(tiny_scene, tmp_path, monkeypatch, capsys):
-    args = command_line("nrfgs", tiny_scene, tmp_path, 2, {"--data": None, "--pipeline.model.num-downscales": 0})
-    lines = []
-    for factor, most in (("1", 1600), ("2", 1600), ("1", 10)):
-        monkeypatch.setattr(trainer_config, "MAX_AUTO_RESOLUTION", most)
-        set_up([*args, "nrfgs-data", "--data", str(tiny_scene), "--downscale-factor", factor])
-        lines.append([line for line in capsys.readouterr().out.splitlines() if line.startswith("Images are read")])
-    where = "(--downscale-factor: docs/own-data.md)."
-    half, full = (f"Images are read at {size} {where}" for size in ("1/2 of their size, 24 x 18", "full size, 48 x 36"))
-    assert lines == [[], [half], [full]]
+SPOKEN = {"--logging.local-writer.enable": True, "--logging.steps-per-log": 1}
+
+
+def test_a_training_with_the_line_is_the_one_without(tiny_scene, tmp_path, monkeypatch):
+    """The second goes on from a checkpoint, though nerfstudio names step 0 with what it logs before the first step."""
+    said = io.StringIO()
+    for name, value in (("SECONDS_BETWEEN_LINES", 0.0), ("SHORTEST", 0.0), ("SHARE", float("inf"))):
+        monkeypatch.setattr(progress, name, value)
+    monkeypatch.setattr(progress, "CONSOLE", Console(file=said, force_terminal=False, width=200))
+    options = {"--pipeline.model.densification": "splatfacto,warmup_length=2,refine_every=4"}
+    half = trained(command_line("nrfgs", tiny_scene, tmp_path / "half", 6, options))
+    load = {"--load-dir": models_of(half)}
+    quiet = trained(command_line("nrfgs", tiny_scene, tmp_path / "quiet", 12, options, load))
+    assert not said.getvalue()
+    spoken = trained(command_line("nrfgs", tiny_scene, tmp_path / "spoken", 12, options, load, SPOKEN))
+    assert_same_training(checkpoint_of(quiet), checkpoint_of(spoken), rtol=0.0, atol=0.0)
+
+    lines = [
+        re.match(r"step (\d+) of 12 .* (\d+\.\d) dB on test view (\S+\.png)", line)
+        for line in said.getvalue().splitlines()
+    ]
+    assert [int(line[1]) for line in lines] == [*range(7, 13), 12] and len({line[3] for line in lines}) == 1

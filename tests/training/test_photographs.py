@@ -32,34 +32,28 @@ SAME, DIFFERENT = pairs_with([0.01] * 10), pairs_with([0.5, -0.8, 0.2, 0.5, -0.4
 CENTERS = torch.arange(11.0)[:, None] * torch.tensor([1.0, 0.0, 0.0])
 
 
-@pytest.mark.parametrize(
-    ("pairs", "known", "wanted", "words"),
-    [
-        (SAME, [NAN] * 11, False, "varies by 0.01 stops, colour by 0.01"),
-        (DIFFERENT, [NAN] * 11, True, "exposure varies by 0.38 stops"),
-        (pairs_with([0.5, -0.5, 0.5]), [NAN] * 11, False, "in common to compare them"),
-        (pairs_with([]), [0.0, 1.5] + [NAN] * 9, True, "exposure varies by 0.75 stops"),
-        (SAME, [0.3] + [NAN] * 10, False, "EXIF: exposure varies by 0.00 stops"),
-        (SAME, [0.3, 0.5] * 5 + [0.3], False, "EXIF: exposure varies by 0.10 stops"),
-        # The light changed, and the camera followed it.
-        (SAME, [0.0, 0.9] * 5 + [0.0], False, "varies by 0.45 stops, which explains 0% of the difference"),
-        (DIFFERENT, [0.0, 0.7] * 5 + [0.0], True, "exposure varies by 0.35 stops, which explains"),
-    ],
-)
+@pytest.mark.parametrize(("pairs", "known", "wanted", "words"), [
+    (SAME, [NAN] * 11, False, "varies by 0.01 stops, colour by 0.01"),
+    (DIFFERENT, [NAN] * 11, True, "exposure varies by 0.38 stops"),
+    (pairs_with([0.5, -0.5, 0.5]), [NAN] * 11, False, "in common to compare them"),
+    (pairs_with([]), [0.0, 1.5] + [NAN] * 9, True, "exposure varies by 0.75 stops"),
+    (SAME, [0.3] + [NAN] * 10, False, "EXIF: exposure varies by 0.00 stops"),
+    (SAME, [0.3, 0.5] * 5 + [0.3], False, "EXIF: exposure varies by 0.10 stops"),
+    # The light changed, and the camera followed it.
+    (SAME, [0.0, 0.9] * 5 + [0.0], False, "varies by 0.45 stops, which explains 0% of the difference"),
+    (DIFFERENT, [0.0, 0.7] * 5 + [0.0], True, "exposure varies by 0.35 stops, which explains"),
+])  # fmt: skip
 def test_the_evidence_decides(pairs, known, wanted, words):
     seen = estimate(pairs, torch.full((11,), NAN), CENTERS)
     evidence = Evidence(pairs, CENTERS, torch.tensor(known), seen)
     assert evidence.calls_for_learning == wanted and words in evidence.numbers
 
 
-def test_exposure_in_stops():
+def test_exposure_in_stops_of_exif_from_the_data_set_or_else_from_the_file(tmp_path):
     exif = {"exposure_time": 0.01, "iso": 100, "f_number": 4.0}
     assert exposure({**exif, "exposure_time": 0.02, "iso": 200}) - exposure(exif) == pytest.approx(2.0)
     assert exposure({**exif, "f_number": 2.0}) - exposure(exif) == pytest.approx(2.0)
     assert math.isnan(exposure({"f_number": 2.0, "iso": 100})) and math.isnan(exposure({}))
-
-
-def test_exif_comes_from_the_data_set_or_else_from_the_file(tmp_path):
     photo = tmp_path / "a.jpg"
     exif = Image.Exif()
     exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.ExposureTime] = 0.25
@@ -69,8 +63,6 @@ def test_exif_comes_from_the_data_set_or_else_from_the_file(tmp_path):
 
 
 # Trainings.
-
-
 def linear(values):
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 

@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from nerfstudio.utils.eval_utils import eval_setup
-from short_trainings import command_line, trained
-from smoke_runs import PLAIN, STEPS, bound, gain_bound
+from short_trainings import PLAIN, SMOKE_STEPS, bound, command_line, gain_bound, trained
 
 from nrfgs_lab.scenes import SceneConfig, write_scene
 from nrfgs_lab.training_run import evaluate
@@ -40,7 +39,7 @@ def test_the_field_carries_what_depends_on_the_view(tmp_path):
 def test_real_photographs_train_and_the_field_is_ahead_of_harmonics(scene, captures, tmp_path):
     scale = {"--pipeline.datamanager.camera-res-scale-factor": 0.125}
     reached = {
-        method: psnr(method, captures / scene, tmp_path, STEPS, scale, {"--machine.seed": 42})
+        method: psnr(method, captures / scene, tmp_path, SMOKE_STEPS, scale, {"--machine.seed": 42})
         for method in ("nrfgs", "nrfgs-sh")
     }
     assert all(value > bound(f"{scene}/{method}") for method, value in reached.items()), reached

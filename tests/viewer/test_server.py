@@ -88,44 +88,31 @@ def test_the_network_is_refused_unless_it_is_asked_for(open_viewer, pipeline, in
     assert "127.0.0.1" in viewer.viewer_info[0] and f"ssh -L {port}:localhost:{port}" in viewer.viewer_info[-1]
 
 
-@pytest.mark.parametrize(
-    "options, says",
-    [
-        ({"websocket_port": 65536}, "port is 65536"),
-        ({"websocket_host": "192.0.2.1"}, "cannot listen on '192.0.2.1'"),  # of no machine (RFC 5737)
-        ({"websocket_host": "." * 70}, "cannot listen on"),
-    ],
-)
+@pytest.mark.parametrize("options, says", [
+    ({"websocket_port": 65536}, "port is 65536"),
+    ({"websocket_host": "192.0.2.1"}, "cannot listen on '192.0.2.1'"),  # of no machine (RFC 5737)
+    ({"websocket_host": "." * 70}, "cannot listen on"),
+])  # fmt: skip
 def test_where_nothing_can_listen_is_told(open_viewer, pipeline, options, says):
     with pytest.raises(InputError, match=says):
         open_viewer(pipeline, LocalViewerConfig(**options))
 
 
-def test_the_network_is_served_if_it_is_asked_for(to_all, interface):
-    port = to_all.viser_server.get_port()
-    status, body = answer(interface, port, "/")
-    assert status == 200 and b"<html" in body.lower()
-    assert "Whoever reaches 0.0.0.0" in to_all.viewer_info[-1]
-
-
-@pytest.mark.parametrize(
-    "path",
-    [
-        "/../../../../../../../../../../etc/passwd",
-        "/%2e%2e/%2e%2e/%2e%2e/%2e%2e/%2e%2e/%2e%2e/etc/passwd",
-        "/../__init__.py",
-        "/assets",
-        "/a\0b",
-        "/" + "a" * 5000,
-        "http://elsewhere/index.html",
-    ],
-)
+@pytest.mark.parametrize("path", [
+    "/../../../../../../../../../../etc/passwd",
+    "/%2e%2e/%2e%2e/%2e%2e/%2e%2e/%2e%2e/%2e%2e/etc/passwd",
+    "/../__init__.py",
+    "/assets",
+    "/a\0b",
+    "/" + "a" * 5000,
+    "http://elsewhere/index.html",
+])  # fmt: skip
 def test_no_file_outside_the_page_is_served(to_all, interface, path):
     status, body = answer(interface, to_all.viser_server.get_port(), path)
     assert status == 404 and body == b"404"
 
 
-def test_the_page_is_served_under_this_machines_names_alone(to_all, interface):
+def test_the_network_is_served_if_it_is_asked_for_under_this_machines_names_alone(to_all, interface):
     port = to_all.viser_server.get_port()
     for name in ("localhost:1234", "127.0.0.1", "[::1]:7007", interface, f"{socket.gethostname()}:{port}"):
         assert answer(interface, port, "/", host=name)[0] == 200, name
@@ -135,6 +122,10 @@ def test_the_page_is_served_under_this_machines_names_alone(to_all, interface):
         assert answer(interface, port, "/", host=name or " ")[0] == 403, name
         assert upgrade(interface, port, host=name or " ") == 403, name
     assert answer(interface, port, "/", f"Host: {interface}")[0] == 403, "two of them"
+    port = to_all.viser_server.get_port()
+    status, body = answer(interface, port, "/")
+    assert status == 200 and b"<html" in body.lower()
+    assert "Whoever reaches 0.0.0.0" in to_all.viewer_info[-1]
 
 
 def test_pages_of_other_origins_are_refused(to_all, interface):
@@ -278,15 +269,12 @@ def test_a_training_survives_odd_messages(tiny_scene, tmp_path):
     assert viewer.viser_server._share_tunnel is None and not viewer.viser_server.gui._current_file_upload_states
 
 
-def test_a_browser_that_leaves_while_its_camera_moves_stops_nobody(to_all):
+def test_a_camera_path_is_saved_in_its_folder_and_a_browser_that_leaves_stops_nobody(to_all):
     """Nerfstudio then raises a KeyError inside `atomic`."""
     with pytest.raises(KeyError), to_all.viser_server.atomic():
         raise KeyError(0)
     assert not to_all.viser_server._websock_server._atomic_lock.locked()
-
-
-def test_a_camera_path_is_saved_in_its_folder(to_all):
-    """Its name is what the browser says, and becomes a file's."""
+    # Its name is what the browser says, and becomes a file's.
     (name,) = to_all.viser_server._websock_server.file_names
     handle = to_all.viser_server.gui._gui_input_handle_from_id[name]
     send(to_all.viser_server.get_port(), [update(handle, "../../../a\\bc")], lambda: "a_b" in handle.value)

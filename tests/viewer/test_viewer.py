@@ -1,41 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
 """The viewer without a GPU or a browser: what each mode shows, and that a browser's wishes reach no training."""
 
+import threading
 from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.cameras import CameraType
+from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.utils import colormaps
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import CameraState
-from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
+from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException, SetTrace
+from PIL import Image
 from short_trainings import assert_same_training, checkpoint_of, command_line, set_up
 from torch.testing import assert_close
 from viser.infra import _infra
 
+from nrfgs_lab.scenes import SceneConfig, write_scene
 from nrfgs_lab.training_run import parse
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sh import ShConfig
+from nrfgs_ns.data.datamanager import NrfgsInputDataset
+from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.model.renderer import View
-from nrfgs_ns.viewer.pictures import (
-    BASE,
-    DEPTH,
-    FULL,
-    VIEW_DEPENDENCE,
-    PictureOptions,
-    legends,
-    picture,
-    scaled_depth,
-    view_dependence,
-)
+from nrfgs_ns.viewer import pictures as drawn
+from nrfgs_ns.viewer import start
+from nrfgs_ns.viewer.pictures import BASE, DEPTH, FULL, VIEW_DEPENDENCE, PictureOptions, legends, picture
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -181,25 +180,23 @@ def test_view_dependence_is_the_deviation_over_the_sphere():
     splats = {"means": means, "opacities": torch.zeros(5, 1), **head.splat_params(torch.full((5, 3), 0.5))}
     visible, center = torch.tensor([0, 2, 3]), torch.tensor([4.0, 0.0, 1.0])
     field, view = Field(head, splats), View(SimpleNamespace(gaussian_ids=visible), center)
-    assert view_dependence(field, view).abs().max() == 0
+    assert drawn.view_dependence(field, view).abs().max() == 0
     splats["features_rest"][2, :, 1] = torch.tensor([0.3, -0.2, 0.1])
     # sqrt(k . k / (4 pi)) in one channel; a third of its square over three channels.
     expected = torch.tensor([0.0, (0.14 / (12 * torch.pi)) ** 0.5, 0.0])[:, None]
     # 12 colours near 1/2 are rounded at 2^-25 each.
-    assert_close(view_dependence(field, view), expected, rtol=0, atol=12 * 2**-25)
+    assert_close(drawn.view_dependence(field, view), expected, rtol=0, atol=12 * 2**-25)
 
 
 def test_depth_is_dark_near_and_bright_far():
     depth = torch.tensor([[1.0, 2.0, 3.0, 50.0]])[..., None]
     opaque = torch.tensor([[1.0, 1.0, 1.0, 0.1]])[..., None]
     # The quantile of three is the second; what is hardly there does not count.
-    assert scaled_depth(depth, opaque).flatten().tolist() == [0.0, 1.0, 1.0, 1.0]
-    assert scaled_depth(depth, 0 * opaque).abs().max() == 0
+    assert drawn.scaled_depth(depth, opaque).flatten().tolist() == [0.0, 1.0, 1.0, 1.0]
+    assert drawn.scaled_depth(depth, 0 * opaque).abs().max() == 0
 
 
 # In nerfstudio's viewer.
-
-
 class Browser(RenderStateMachine):
     """One of the viewer's render threads, which renders one image as it would for a browser, and ends."""
 
@@ -373,3 +370,54 @@ def test_an_interrupted_rendering_leaves_no_lock_behind(build, open_viewer):
         panel.render(camera)
     assert panel.count.value == f"{pipeline.model.num_points:,}"
     assert not lock.locked()
+
+
+# The viewer opens without reading anything twice, and shows what it showed.
+def test_a_training_s_photographs_are_not_read_again(pipeline, tiny_scene, tmp_path, monkeypatch):
+    dataset, reads, shown = pipeline.datamanager.train_dataset, [], []
+    get_data, threads = NrfgsInputDataset.get_data, torch.get_num_threads()
+    monkeypatch.setattr(NrfgsInputDataset, "get_data", lambda *args, **more: reads.append(1) or get_data(*args, **more))
+    log, lock = tmp_path / "log", threading.Lock()
+    viewer = Viewer(ViewerConfig(), log, datapath=tiny_scene, pipeline=pipeline, train_lock=lock)
+    scene = viewer.viser_server.scene
+    add = scene.add_camera_frustum
+    monkeypatch.setattr(scene, "add_camera_frustum", lambda **what: shown.append(what["image"]) or add(**what))
+    try:
+        viewer.init_scene(dataset, "training")
+        assert len(shown) == len(dataset) and reads == []
+        assert torch.get_num_threads() == threads
+        Viewer.init_scene.__wrapped__(viewer, dataset, "training")
+        assert reads != []
+        ours, theirs = (np.stack(some).astype(int) for some in (shown[: len(dataset)], shown[len(dataset) :]))
+        assert np.abs(ours - theirs).max() <= 1, "but for the rounding of a byte"
+    finally:
+        viewer.viser_server.stop()
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    config = SceneConfig(views=3, width=640, height=400, points=50, samples=1)
+    scene = write_scene(config, tmp_path_factory.mktemp("large"))
+    return NrfgsInputDataset(NrfgsDataParserConfig(data=scene).setup().get_dataparser_outputs("train"))
+
+
+@pytest.mark.parametrize("read", [True, False], ids=["read", "in files"])
+def test_large_photographs_come_small(dataset, read):
+    images = [dataset.get_data(index, image_type="uint8") for index in range(len(dataset))] if read else None
+    small = start.SmallPhotographs(dataset, images)
+    assert len(small) == len(dataset) and small.cameras is dataset.cameras
+    image = small[0]["image"]
+    assert min(image.shape[:2]) in range(start.SIDE, 2 * start.SIDE) and image.shape[2] == 3
+    whole = dataset.get_data(0)["image"].permute(2, 0, 1)[None]
+    shape = tuple(image.shape[:2])
+    expected = torch.nn.functional.interpolate(whole, shape, mode="area")[0].permute(1, 2, 0)
+    assert (image - expected).abs().mean() < 0.03
+
+
+@pytest.mark.parametrize("mode", ["L", "RGBA", "P", "CMYK"])
+def test_a_photograph_of_any_mode_is_shown_in_colour(tmp_path, mode):
+    path = tmp_path / ("a.jpg" if mode == "CMYK" else "a.png")
+    Image.fromarray(np.full((30, 40, 3), 153, np.uint8)).convert(mode).save(path)
+    dataset = type("", (), {"cameras": None, "image_filenames": [path]})()
+    image = start.SmallPhotographs(dataset, None)[0]["image"]
+    assert image.shape == (30, 40, 3) and (image - 153 / 255).abs().max() < 0.02

@@ -89,8 +89,6 @@ def test_a_folder_comes_back(tmp_path):
 
 
 # The trade: a front and prices.
-
-
 @given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=12))
 def test_front_is_what_nothing_beats(points):
     """Against the definition, on a grid so coarse that ties are common."""

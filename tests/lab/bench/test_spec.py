@@ -31,8 +31,6 @@ def spec(**more):
 
 
 # The file.
-
-
 def plans() -> dict[tuple[str, str], Spec]:
     """Each plan of the shipped files, by file and name."""
     result = {}
@@ -63,25 +61,22 @@ def test_which_trainings_a_plan_has():
     assert "--max-num-iterations" not in command(plan, cells[1], [], Path())
 
 
-@pytest.mark.parametrize(
-    "content, says",
-    [
-        ({"runs": {"NRF": {"options": "-x"}}}, "NRF names no method"),
-        ({"runs": {"NRF": {"method": "nrfgs", "colour": 3}}}, "NRF: unknown key.*colour"),
-        ({"strategies": ["mcmc@many"]}, "budget is 'many'"),
-        ({"seeds": ["x"]}, "seeds"),
-        ({"scenes": ["a b", "a_b"]}, "twice"),
-        ({"runs": {"host": {"method": "splatfacto", "strategies": ["original"]}}}, "splatfacto knows no strategy"),
-        ({"runs": {"N": {"method": "nrfgs", "options": "--max-num-iterations 9"}}}, "N: options: --max-num.*use steps"),
-        ({"options": "--machine.seed=3"}, "options: --machine.seed is given by the benchmark; use seeds"),
-        ({"strategies": []}, "strategies or seeds is empty"),
-        ({"scenes": ["../bonsai"]}, "no folder below --scenes"),
-        (
-            {"strategies": ["mcmc"], "options": "--pipeline.model.densification original"},
-            "densification is given.*mcmc",
-        ),
-    ],
-)
+@pytest.mark.parametrize("content, says", [
+    ({"runs": {"NRF": {"options": "-x"}}}, "NRF names no method"),
+    ({"runs": {"NRF": {"method": "nrfgs", "colour": 3}}}, "NRF: unknown key.*colour"),
+    ({"strategies": ["mcmc@many"]}, "budget is 'many'"),
+    ({"seeds": ["x"]}, "seeds"),
+    ({"scenes": ["a b", "a_b"]}, "twice"),
+    ({"runs": {"host": {"method": "splatfacto", "strategies": ["original"]}}}, "splatfacto knows no strategy"),
+    ({"runs": {"N": {"method": "nrfgs", "options": "--max-num-iterations 9"}}}, "N: options: --max-num.*use steps"),
+    ({"options": "--machine.seed=3"}, "options: --machine.seed is given by the benchmark; use seeds"),
+    ({"strategies": []}, "strategies or seeds is empty"),
+    ({"scenes": ["../bonsai"]}, "no folder below --scenes"),
+    (
+        {"strategies": ["mcmc"], "options": "--pipeline.model.densification original"},
+        "densification is given.*mcmc",
+    ),
+])  # fmt: skip
 def test_what_is_wrong_is_named(content, says):
     with pytest.raises(InputError, match=says):
         spec(**content)
@@ -106,14 +101,8 @@ def test_a_preset_keeps_its_steps():
 
 
 # Commands.
-
-
 @pytest.mark.parametrize(
-    "strategy, densification",
-    [
-        ("own", ErrorGuided()),
-        ("mcmc@77,refine_every=9", Mcmc(budget=77, refine_every=9)),
-    ],
+    "strategy, densification", [("own", ErrorGuided()), ("mcmc@77,refine_every=9", Mcmc(budget=77, refine_every=9))]
 )
 def test_the_command_means_what_the_file_says(strategy, densification, tiny_scene, tmp_path):
     runs = {"NRF": {"method": "nrfgs", "options": "--pipeline.model.appearance.latent-dim 9"}}
@@ -145,8 +134,6 @@ def test_fingerprints_ignore_paths_and_see_the_rest():
 
 
 # Data sets.
-
-
 def load(parser: list[str], method: str = "nrfgs"):
     """The data manager that ns-train would have, with all its images."""
     data = parse([method, *parser]).pipeline.datamanager.setup(device="cpu", test_mode="val")

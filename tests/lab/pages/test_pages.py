@@ -17,7 +17,7 @@ import tyro
 from nerfstudio.configs import method_configs
 from nerfstudio.plugins.registry import discover_methods
 from nerfstudio.utils import eval_utils
-from smoke_runs import recorded
+from short_trainings import recorded
 
 from nrfgs_lab.pages.options import PAGE, explanation, methods, own_options, page
 from nrfgs_lab.pages.tables import pages
@@ -58,11 +58,8 @@ def test_it_trains_under_the_name_that_the_page_gives_it(my_head, tiny_scene, tm
     assert reached > recorded()["tiny/nrfgs-sh"]["after_one_step"]
 
 
-def test_the_page_is_current():
+def test_the_page_of_options_is_current_and_explains_each():
     assert PAGE.read_text(encoding="utf-8") == page(), "write it again: python -m nrfgs_lab.pages.options"
-
-
-def test_every_option_is_explained():
     options = [option for method in methods() for option in own_options(method.config)]
     assert len(options) > 100
     assert [option.flag for option in options if not option.text] == []

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from nrfgs_lab.pages import tables
+from nrfgs_lab.pages.figures import FIGURES
 from nrfgs_lab.pages.tables import BLOCK, BLOCKS, ROOT, SHEET, declared, pages, written
 
 PAGES = {str(page.relative_to(ROOT)): page.read_text(encoding="utf-8") for page in pages()}
@@ -53,10 +54,12 @@ def test_a_number_that_is_not_the_record_s_is_noticed():
     assert changed != text and written(changed) == text
 
 
-def test_every_block_is_on_a_page():
+def test_every_block_and_picture_is_on_a_page():
     used = {match[1] + (match[2] or "") for text in PAGES.values() for match in BLOCK.finditer(text)}
     assert set(declared()) <= used
     assert set(BLOCKS) <= {name.partition("(")[0] for name in used}
+    shown = {Path(link).name for text in PAGES.values() for link in LINK.findall(text)}
+    assert {path.name for path in (ROOT / "docs" / "images").iterdir()} <= shown
 
 
 def test_every_record_is_shown_or_used():
@@ -79,6 +82,6 @@ def test_files_that_a_page_names_are_there(name):
     assert [path for path in paths if not any((ROOT / f"{path}{end}").exists() for end in ("", ".py"))] == []
 
 
-def test_every_picture_is_shown():
-    shown = {Path(link).name for text in PAGES.values() for link in LINK.findall(text)}
-    assert {path.name for path in (ROOT / "docs" / "images").iterdir()} <= shown
+@pytest.mark.parametrize("name", FIGURES)
+def test_a_figure_is_that_of_the_records(name):
+    assert FIGURES[name]() == (ROOT / "docs" / "images" / name).read_text(encoding="utf-8")

@@ -5,6 +5,7 @@ Its import needs a library that a fresh Linux machine lacks. A test that leans o
 that library, and fail on the next machine.
 """
 
+import gc
 import os
 import sys
 from collections.abc import Iterator
@@ -36,3 +37,24 @@ def open3d_shown() -> Iterator[None]:
         for name in list(sys.modules):
             if name.split(".")[0] == "open3d" or name == "nerfstudio.scripts.exporter":
                 shown[name] = sys.modules.pop(name)
+
+
+# A quick start of each training in a process of tests.
+FREEZE, UNFREEZE = gc.freeze, gc.unfreeze
+
+
+def keep_what_is_imported() -> None:
+    """Keep the garbage collector off all that is imported, until `let_go`.
+
+    Each training would walk through hundreds of thousands of objects, freeze them and thaw them again, which takes as
+    long as ten of its steps. `test_lifecycle.py` checks that it does.
+    """
+    gc.collect()
+    FREEZE()
+    gc.freeze = gc.unfreeze = lambda: None
+
+
+def let_go() -> None:
+    """Give everything back to the garbage collector: bindings in C++ complain of what is left when Python ends."""
+    gc.freeze, gc.unfreeze = FREEZE, UNFREEZE
+    UNFREEZE()

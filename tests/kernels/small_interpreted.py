@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The kernels of the loss, the growth's statistics and the tiles' lists in Triton's interpreter against their twins."""
+
+import pytest
+import quick_interpreter  # noqa: F401
+import torch
+from ssim_cases import TOLERANCE, assert_near, pair
+from tile_list_cases import Splats, assert_lists, splats
+from torch.testing import assert_close
+
+from nrfgs_ns.densification.statistics import add_in_torch, raise_in_torch
+from nrfgs_ns.densification.statistics_triton import add, raise_maxima
+from nrfgs_ns.image import ssim_triton
+from nrfgs_ns.image.ssim import photometric_loss
+from nrfgs_ns.rasterizer.tile_lists import tile_lists
+
+
+# The loss, against pytorch_msssim in float64. A row of a program takes about a tenth of a second, hence small images.
+def test_several_blocks_and_strips(monkeypatch):
+    """Windows cross the borders of two blocks of columns and of two strips of rows."""
+    monkeypatch.setattr(ssim_triton, "COLUMNS", 32)
+    monkeypatch.setattr(ssim_triton, "ROWS", 6)
+    prediction, truth = pair(12, 18)
+    loss = ssim_triton.WeightedSum.apply(prediction, truth, 0.8, -0.2, 0.2)
+    assert_near(loss, prediction, truth, 0.2, TOLERANCE)
+
+
+def test_one_window_and_upstream_gradient(monkeypatch):
+    monkeypatch.setattr(ssim_triton, "COLUMNS", 64)
+    monkeypatch.setattr(ssim_triton, "ROWS", 11)
+    prediction, truth = pair(11, 11)
+    got = ssim_triton.WeightedSum.apply(prediction, truth, 0.0, -1.0, 1.0)
+    (3.0 * got).backward()
+    twin = prediction.detach().double().requires_grad_()
+    expected = photometric_loss(twin, truth.double(), 1.0)
+    (3.0 * expected).backward()
+    assert (got.double() - expected).abs() <= TOLERANCE
+    assert (prediction.grad - twin.grad).abs().max() <= TOLERANCE * twin.grad.abs().max()
+
+
+# The growth's statistics.
+@pytest.mark.parametrize("names", [("grad2d", "count"), ("grad2d", "count", "radii")])
+@pytest.mark.parametrize("visible", [0, 1, 300])
+def test_the_kernel_adds_what_its_twin_adds(names, visible):
+    torch.manual_seed(0)
+    rows = torch.randperm(400)[:visible].sort().values
+    gradients, radii = torch.randn(visible, 2), torch.randint(0, 5, (visible,), dtype=torch.int32)
+    mine = {name: torch.rand(400) for name in names}
+    theirs = {name: value.clone() for name, value in mine.items()}
+    add(mine["grad2d"], mine["count"], mine.get("radii"), rows, gradients, radii, (400.0, 300.0), 1 / 800.0)
+    add_in_torch(theirs, rows, gradients, radii, (400.0, 300.0), 800.0)
+    for name in names:
+        assert_close(mine[name], theirs[name], rtol=1e-6, atol=0.0)
+
+
+@pytest.mark.parametrize("grows", [True, False])
+@pytest.mark.parametrize("peak", [True, False])
+@pytest.mark.parametrize("visible", [0, 1, 300])
+def test_the_kernel_raises_what_its_twin_raises(grows, peak, visible):
+    torch.manual_seed(0)
+    rows, radii = torch.randperm(400)[:visible], torch.randint(0, 5, (visible,), dtype=torch.int32)
+    gradients, change = torch.randn(visible, 2) if grows else None, torch.rand(visible) - 0.5 if peak else None
+    mine = [torch.rand(400) / 50, torch.rand(400) * 300 if grows else None, torch.rand(400) - 1.0 if peak else None]
+    theirs = [None if value is None else value.clone() for value in mine]
+    raise_maxima(*mine, rows, radii, gradients, change, 1 / 400.0, (400.0, 300.0))
+    raise_in_torch(*theirs, rows, radii, gradients, change, 400.0, (400.0, 300.0))
+    for value, twin in zip(mine, theirs, strict=True):
+        if twin is not None:
+            assert_close(value, twin, rtol=1e-6, atol=0.0)
+
+
+# The tiles' lists, against every pixel of every tile.
+def test_tiles_list_what_draws_in_them():
+    of = splats(200, 100, 70)
+    lists = tile_lists(*of, 7, 5, 16)
+    assert assert_lists(*lists, of, 7, 5, 16) <= 0.1 * len(lists[1])
+
+
+def test_rectangles_bound_splats():
+    of = splats(60, 60, 40, seed=1)
+    of = of._replace(radii=torch.stack([of.radii, (of.radii + 1) // 2], dim=1))
+    assert_lists(*tile_lists(*of, 8, 5, 8), of, 8, 5, 8)
+
+
+def test_splats_that_are_long_far_off_or_no_ellipses():
+    """A line of a pixel's width across the image, one whose centre is far outside, and a conic without determinant."""
+    of = Splats(
+        means2d=torch.tensor([[50.0, 30.0], [-3000.0, -3000.0], [20.0, 20.0]]),
+        radii=torch.tensor([3000, 5000, 20], dtype=torch.int32),
+        depths=torch.tensor([3.0, 2.0, 1.0]),
+        conics=torch.tensor([[0.51, -0.4999999, 0.49], [1e-6, 0.0, 1e-6], [0.5, 0.5, 0.5]]),
+        opacities=torch.tensor([0.9, 0.9, 0.9]),
+    )
+    assert_lists(*tile_lists(*of, 7, 5, 16), of, 7, 5, 16)
+
+
+def test_what_is_not_finite_is_left_out():
+    of = splats(40, 60, 40, seed=2)
+    colors = torch.rand(len(of.depths), 4)
+    bad = Splats(*(table.clone() for table in of))
+    bad.means2d[0, 1] = bad.conics[1, 2] = bad.opacities[2] = float("nan")
+    bad.conics[3, 0] = float("inf")
+    colors[4, 3], colors[5, 0] = float("inf"), float("nan")
+    _, rows = tile_lists(*bad, 4, 3, 16, colors)
+    whole = tile_lists(*of, 4, 3, 16)[1]
+    assert rows.tolist() == [row for row in whole.tolist() if row > 5]
+    shown = tile_lists(*bad, 4, 3, 16)[1].tolist()  # without a check they are listed, and show
+    assert shown.count(1) >= whole.tolist().count(1) > 0 and shown.count(2) >= whole.tolist().count(2)
+    assert {3, 4} & set(whole.tolist())
