@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hard trainings end with finite numbers. docs/troubleshooting.md."""
+"""The catalogue of extremes: its checks hold, and its tests exist. Hard trainings must end with finite numbers.
+docs/troubleshooting.md."""
 
+import ast
 import json
 import shutil
 from functools import partial
@@ -13,10 +15,24 @@ from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 from short_trainings import command_line, trained
 from small_capture import rescale
+from stability_catalogue import CATALOGUE
 
 from nrfgs_lab.scenes import SceneConfig, write_scene
 from nrfgs_lab.training_run import evaluate
 from nrfgs_ns.method_config import nrfgs
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.mark.parametrize("quantity", CATALOGUE, ids=lambda quantity: quantity.name)
+def test_check_holds(quantity):
+    assert quantity.check() is True
+
+
+def test_every_test_that_is_named_exists():
+    for file, name in {tuple(test.split("::")) for quantity in CATALOGUE for test in quantity.tests}:
+        tree = ast.parse((ROOT / file).read_text())
+        assert name in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}, f"{file}::{name}"
 
 
 def paint(folder: Path, value: int) -> None:
@@ -60,7 +76,10 @@ def test_hard_trainings_end_finite(name, tmp_path):
     edit, options, words = HARD[name]
     data = write_scene(SceneConfig(views=16, width=48, height=36, points=600, samples=2), tmp_path / "scene")
     edit(data)
-    usual = {"--pipeline.model.num-downscales": 0, "--pipeline.model.densification": "splatfacto,warmup_length=100"}
+    usual = {
+        "--pipeline.model.num-downscales": 0,
+        "--pipeline.model.densification": "splatfacto,warmup_length=100",
+    }
     config = trained([*command_line("nrfgs", data, tmp_path / "outputs", 200, usual, options), *words])
     results = evaluate(config, tmp_path / "eval.json")
     assert all(results[name] is not None for name in ("psnr", "ssim", "l1"))  # what is NaN is None there

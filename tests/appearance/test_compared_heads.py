@@ -35,16 +35,21 @@ def test_sum_ignores_higher_coefficients(degree):
     assert_close(eval_sh(degree, 3.0 * unit(50), coefficients), expected, rtol=0, atol=1e-12)
 
 
-def test_degree_ramp_is_splatfactos_and_an_impossible_degree_is_named():
+def test_degree_ramp_is_splatfactos():
     head = ShConfig(degree=3, degree_interval=1000).setup()
     for step, degree in ((0, 0), (999, 0), (1000, 1), (2500, 2), (3000, 3), (30_000, 3)):
         head.set_step(step)
         assert head.active_degree == degree
+
+
+def test_impossible_degree_is_named():
     with pytest.raises(ValueError, match="appearance.degree is 4"):
         ShConfig(degree=4).setup()
 
 
 # GSNB.
+
+
 def gsnb_by_hand(head, splats, visible, centers, ramp):
     """The formulas, one splat at a time, with nothing shared with the implementation but the weights."""
     first, _, second, _, third, _ = head.basis
@@ -85,6 +90,8 @@ def test_learnt_functions_use_the_coefficients_of_degrees_that_are_still_off():
 
 
 # SG.
+
+
 def sg_by_hand(splats, visible, centers):
     """The formula, one splat and one lobe at a time, in Python's own arithmetic."""
     colors = []
@@ -150,6 +157,8 @@ def test_before_its_step_there_is_the_base_alone_and_no_gradient_to_the_lobes():
 
 
 # VDGS.
+
+
 def grid_by_hand(table, x):
     """The paper's four levels at one position, corner by corner, the hash in unsigned 32-bit integers."""
     features = []
@@ -220,6 +229,17 @@ def grid():
     grid = HashGrid(16).double()
     grid.table.data.normal_()
     return grid
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_features_are_continuous_across_cells_zero_and_the_cube(axis, grid):
+    x = torch.rand(40, 3, dtype=torch.double) * 2 - 1
+    x[:, axis] = torch.arange(-20, 20) / 16  # faces of cells on level 0, of some on the others
+    before, after = x.clone(), x.clone()
+    before[:, axis] -= 1e-9
+    after[:, axis] += 1e-9
+    # A feature changes by at most 54 steps per unit times the largest difference of two normal numbers among 2^19.
+    assert (grid(after) - grid(before)).abs().max() < 2e-9 * 54 * 10
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -50,16 +50,19 @@ def test_rounded_products(precision, repeated):
 
 @pytest.mark.parametrize("way", [0, 1])
 @pytest.mark.parametrize("repeated", [False, True])
-@pytest.mark.parametrize("config", [
-    {"num_bands": 1, "latent_dim": 1, "hidden_width": 5},
-    {"num_bands": 2, "latent_dim": 7, "hidden_width": 20},
-    {"num_bands": 5, "latent_dim": 33, "hidden_width": 64},
-    {"num_bands": 7, "latent_dim": 64, "hidden_width": 30},
-    {"hidden_width": 128},
-    {"num_bands": 1, "latent_dim": 16, "hidden_width": 256, "split_bands": False},
-    {"split_bands": False, "opacity_residual": False},
-    {"opacity_bound": "logit", "use_distance": False},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "config",
+    [
+        {"num_bands": 1, "latent_dim": 1, "hidden_width": 5},
+        {"num_bands": 2, "latent_dim": 7, "hidden_width": 20},
+        {"num_bands": 5, "latent_dim": 33, "hidden_width": 64},
+        {"num_bands": 7, "latent_dim": 64, "hidden_width": 30},
+        {"hidden_width": 128},
+        {"num_bands": 1, "latent_dim": 16, "hidden_width": 256, "split_bands": False},
+        {"split_bands": False, "opacity_residual": False},
+        {"opacity_bound": "logit", "use_distance": False},
+    ],
+)
 def test_sizes_and_ways(config, repeated, way, monkeypatch):
     """Every size that the kernels take, launched in the first way and in the one for small cards."""
     from nrfgs_ns.appearance.fused import launch
@@ -99,7 +102,28 @@ def test_auto_takes_the_kernels_and_falls_back():
         head(*case)
 
 
+def test_rows_beyond_32_bit_offsets():
+    """The last rows of a table of more than 2^31 latents: 9 GB, and as much again for the gradient."""
+    count = 2**26 + 5
+    if torch.cuda.mem_get_info()[0] < 30 * 2**30:
+        pytest.skip("needs 30 GB of GPU memory")
+    head, _ = heads("cuda")
+    small, _, center = scene(head, 3, 3)
+    rows = torch.arange(3, device="cuda")
+    near = evaluate(head, small, rows, center)
+    large = {name: torch.zeros(count, value.shape[1], device="cuda") for name, value in small.items()}
+    for name, table in large.items():
+        table[count - 3 :] = small[name]
+        table.requires_grad_()
+    colors, opacities = head(large, rows + count - 3, center)
+    assert torch.equal(colors, near["colors"]) and torch.equal(opacities, near["opacities"])
+    (colors.sum() + opacities.sum()).backward()
+    assert all((table.grad[count - 3 :] != 0).any() for table in large.values())
+    assert all((table.grad[: count - 3] == 0).all() for table in large.values())
+
+
 # The hash grid of VDGS.
+
 PAPER = {"levels": 4, "log2_table_size": 15, "base_resolution": 16}
 
 

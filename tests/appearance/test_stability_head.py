@@ -66,12 +66,22 @@ def assert_healthy(head, splats, center, rows=None):
 
 
 @pytest.mark.parametrize("head", HEADS)
-@pytest.mark.parametrize("extreme", [
-    *(Extreme(distance=10.0**exponent, coordinate=0.0) for exponent in (-30, -20, -12, -3, 3, 12, 19, 30)),
-    *(Extreme(coordinate=at, distance=distance) for at in (1e-6, 1e6) for distance in (1e-6, 1.0, 1e6)),
-    *(Extreme(latent=size) for size in (1e4, 1e10, 1e20)),
-    *(Extreme(color=color) for color in (-1e18, 1e4, 1e18)),
-])  # fmt: skip
+@settings(max_examples=12, derandomize=True)
+@given(exponent=st.floats(-30, 30), seed=st.integers(0, 99))
+def test_distances_from_1e_30_to_1e30(head, exponent, seed):
+    head, splats, center = build(head, Extreme(distance=10.0**exponent, coordinate=0.0), seed=seed)
+    assert_healthy(head, splats, center)
+
+
+@pytest.mark.parametrize("head", HEADS)
+@pytest.mark.parametrize(
+    "extreme",
+    [
+        *(Extreme(coordinate=at, distance=distance) for at in (1e-6, 1e6) for distance in (1e-6, 1.0, 1e6)),
+        *(Extreme(latent=size) for size in (1e4, 1e10, 1e20)),
+        *(Extreme(color=color) for color in (-1e18, 1e4, 1e18)),
+    ],
+)
 def test_coordinates_latents_and_base_colours(head, extreme):
     """At 1e6, float32 sees positions on a grid of 1/16: splats closer than that are on the camera, and no harm done."""
     assert_healthy(*build(head, extreme))
@@ -132,6 +142,15 @@ def test_opacity_rises_with_its_logit(a, b, scale, bound):
     assert torch.isfinite(logit.grad).all() and torch.isfinite(residual.grad).all() and (residual.grad >= 0).all()
 
 
+@given(st.floats(-17, 17), st.floats(-17, 17), st.integers(0, 99))
+def test_log_distance_rises_with_distance(a, b, seed):
+    """Up to rounding: r is off by 4 roundings (difference, square and sum, root) and its logarithm by one more."""
+    direction = torch.nn.functional.normalize(torch.randn(1, 3, generator=torch.Generator().manual_seed(seed)))
+    near, far = (view_geometry(direction * 10.0**x, torch.zeros(3), 0.01)[1] for x in sorted((a, b)))
+    assert far >= near - 6 * U - U * far.abs()
+    assert near >= math.log(0.01) * (1 + 2 * U)
+
+
 def test_beyond_the_farthest_nothing_moves_any_more():
     means = torch.tensor([[FARTHEST * 10, 0.0, 0.0], [3e38, 1e30, 3e38]], requires_grad=True)
     directions, log_distance = view_geometry(means, torch.full((3,), -3e38), 0.01)
@@ -143,8 +162,7 @@ def test_beyond_the_farthest_nothing_moves_any_more():
 @settings(max_examples=60, derandomize=True)
 @given(st.floats(-18, 17), st.integers(0, 999))
 def test_direction_distance_and_bands_agree_with_float64(exponent, seed):
-    """v is one rounding off, r and d = v / r four more: 8 u bounds d. A band's angle 2^k pi d is off by 2^k pi times
-    that and by two roundings of its own, and sin and cos by 2 u. log r: 6 u + u |log r|."""
+    """Inputs of the field; the bounds are those of the next test."""
     generator = torch.Generator().manual_seed(seed)
     means = torch.randn(50, 3, generator=generator) * 10.0**exponent
     center = torch.randn(3, generator=generator) * 10.0**exponent
@@ -156,3 +174,66 @@ def test_direction_distance_and_bands_agree_with_float64(exponent, seed):
     for k in range(6):
         error = (bands.double() - exact_bands)[:, 6 * k : 6 * k + 6].abs()
         assert (error <= 2.0**k * math.pi * 10 * U + 2 * U).all()
+
+
+@settings(max_examples=60, derandomize=True)
+@given(
+    latent=st.floats(-3, 4),
+    weight=st.floats(-2, 2),
+    distance=st.floats(-18, 17),
+    logit=st.floats(-1e4, 1e4),
+    color=st.floats(-3, 4),
+    seed=st.integers(0, 999),
+)
+def test_the_field_agrees_with_float64(latent, weight, distance, logit, color, seed):
+    """|float32 - float64| under a bound that follows the arithmetic through both layers, input by input.
+
+    Inputs. v is one rounding off, r and d = v / r four more: 8 u bounds d. A band's angle 2^k pi d is off by 2^k pi
+    times that and by two roundings of its own, and sin and cos by 2 u: 2^k pi 10 u + 2 u. log r: 6 u + u |log r|.
+    The colour 1/2 + c0 f: 2 u (1/2 + |c0 f|). alpha: 4 u. The latents are exact.
+
+    Layers. A sum of n products and a bias is off by (n + 1) u times the sum of absolute values, in whatever order it
+    is taken; errors of its inputs pass through |W|. ReLU does not amplify. dc_low + sigmoid(w) dc_high is off by
+    e_low + e_high + |dc_high| (e_w / 4 + 2 u) + 2 u of its value. tanh's slope is at most 1; s_c scales; and sum and
+    result round once each, with 4 u of the base for its own error.
+    """
+    sizes = {"latent": latent, "weight": weight, "distance": distance, "color": color}
+    extreme = Extreme(**{name: 10.0**size for name, size in sizes.items()}, logit=logit, coordinate=0.0)
+    head, splats, center = build("nrf", extreme, seed=seed)
+    rows = torch.arange(6)
+    with torch.no_grad():
+        got = head(splats, rows, center)
+        double = {name: value.double() for name, value in splats.items()}
+        exact_head = head.double()
+        exact = exact_head(double, rows, center.double())
+
+        directions, log_r = view_geometry(double["means"], center.double(), head.config.distance_eps)
+        low, high = fourier_bands(directions, 3)
+        c = 0.5 + 0.28209479177387814 * double["features_dc"]
+        alpha = torch.sigmoid(double["opacities"])
+        z = double["latents"]
+
+        def band(k: int):
+            return torch.full((6, 6), 2.0**k * math.pi * 10 * U + 2 * U, dtype=torch.float64)
+
+        shared = [(z, 0 * z), (c, 2 * U * (0.5 + (c - 0.5).abs())), (log_r, 6 * U + U * log_r.abs())]
+        e_low = torch.cat([torch.full((6, 3), 8 * U, dtype=torch.float64), band(0)], 1)
+        out, e_out = layers(head.low, [*shared, (alpha, 4 * U + 0 * alpha), (low, e_low)])
+        detail, e_detail = layers(head.high, [*shared, (high, torch.cat([band(1), band(2)], 1))])
+        dc = out[:, :3] + torch.sigmoid(detail[:, 3:]) * detail[:, :3]
+        e_dc = e_out[:, :3] + e_detail[:, :3] + detail[:, :3].abs() * (e_detail[:, 3:] / 4 + 2 * U) + 2 * U * dc.abs()
+        tolerance = 0.2 * e_dc.clamp(max=2.0) + 4 * U * (0.5 + c.abs())
+        assert ((got.colors.double() - exact.colors).abs() <= tolerance).all()
+        tolerance = 0.2 * e_out[:, 3].clamp(max=2.0) + 8 * U
+        assert ((got.opacities.double() - exact.opacities).abs() <= tolerance).all()
+
+
+def layers(net, inputs):
+    """Value and error bound [M, out] of a two-layer network in float32, for inputs with error bounds; in float64."""
+    x, e = (torch.cat(parts, dim=1) for parts in zip(*inputs, strict=True))
+    for i, layer in enumerate((net[0], net[2])):
+        W, b = layer.weight.double(), layer.bias.double()
+        e = (W.shape[1] + 1) * U * (x.abs() @ W.abs().T + b.abs()) + e @ W.abs().T * (1 + 60 * U)
+        x = x @ W.T + b
+        x = x.relu() if i == 0 else x
+    return x, e

@@ -3,7 +3,9 @@
 
 import base64
 import json
+import re
 from html.parser import HTMLParser
+from pathlib import Path
 
 import pytest
 
@@ -11,8 +13,9 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.web.command import weight_vectors
 from nrfgs_ns.export.web.guide import read_notes, read_tour
-from nrfgs_ns.export.web.page import page
+from nrfgs_ns.export.web.page import READER, VIEWER, page
 
+REPOSITORY = Path(__file__).parents[2]
 ABOUT = {"photographs": [{"name": "</script><script>alert(1)</script>.png"}], "start": 0}
 
 
@@ -34,7 +37,7 @@ class Elements(HTMLParser):
             self.scripts.setdefault(attributes.get("id"), data)
 
 
-def test_a_page_needs_nothing_but_itself_or_names_its_scene():
+def test_a_page_needs_nothing_but_itself():
     scene = bytes(range(256)) * 10
     text = page(ABOUT, b"a picture", scene, "Tea & <cakes>", 'Me "and" you')
     elements = Elements(text)
@@ -47,18 +50,39 @@ def test_a_page_needs_nothing_but_itself_or_names_its_scene():
     policy = next(dict(attributes)["content"] for _, attributes in elements.tags if "http-equiv" in attributes)
     assert "default-src 'none'" in policy and "connect-src 'none'" in policy
     assert "{{" not in text.replace(elements.scripts["packed"], "")
+
+
+def test_a_page_in_a_folder_names_its_scene():
     text = page(ABOUT, b"", "scene.nrf", "Tea")
     assert Elements(text).scripts["packed"] == "scene.nrf" and "connect-src 'self'" in text
 
 
-@pytest.mark.parametrize("options, vectors", [
-    ({}, 16 * (10 + 4) + 1 + 16 * (13 + 4) + 1),
-    ({"hidden_width": 30, "num_bands": 2, "use_distance": False}, 8 * (9 + 4) + 1 + 8 * (6 + 4) + 1),
-    ({"split_bands": False}, 32 * (22 + 4) + 1),
-    ({"num_bands": 1}, 16 * (10 + 4) + 1),
-])  # fmt: skip
+def test_the_style_and_the_scripts_are_installed_with_the_package():
+    listed = re.search(r'^"nrfgs_ns.export.web" = (\[.*\])', (REPOSITORY / "pyproject.toml").read_text(), re.M)
+    patterns = json.loads(listed.group(1))
+    folder = REPOSITORY / "nrfgs_ns" / "export" / "web"
+    installed = {path.name for pattern in patterns for path in folder.glob(pattern)}
+    assert {*READER, *VIEWER, "page.html", "page.css"} <= installed
+
+
+@pytest.mark.parametrize(
+    "options, vectors",
+    [
+        ({}, 16 * (10 + 4) + 1 + 16 * (13 + 4) + 1),
+        ({"hidden_width": 30, "num_bands": 2, "use_distance": False}, 8 * (9 + 4) + 1 + 8 * (6 + 4) + 1),
+        ({"split_bands": False}, 32 * (22 + 4) + 1),
+        ({"num_bands": 1}, 16 * (10 + 4) + 1),
+    ],
+)
 def test_how_many_weights_a_view_needs(options, vectors):
     assert weight_vectors(NrfConfig(**options).setup()) == vectors
+
+
+def test_the_code_of_a_page_is_small():
+    """What a reader downloads besides the scene and the picture; without comments and indentation, with the licence."""
+    text = page({}, b"", b"", "")
+    assert len(text.encode()) <= 100_000
+    assert not re.search(r"^(?: |// (?!SPDX))", text, re.M) and "SPDX-License-Identifier" in text
 
 
 NAMES = ["a.jpg", "b.jpg", "7.jpg"]

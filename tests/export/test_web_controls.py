@@ -3,6 +3,8 @@
 
 import functools
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -21,6 +23,11 @@ WINDOWS = {
     "turned": ((640, 360), {"has_touch": True}),
 }
 TABS = ["View", "Photographs", "Share", "Help"]
+LARGE = 44
+"""CSS pixels that a fingertip needs."""
+CONTROLS = (
+    "#bar button, #panel button, #panel select, #panel input:not([type=checkbox]), #panel label.line, #panel summary"
+)
 
 
 @pytest.fixture(params=WINDOWS)
@@ -61,11 +68,41 @@ def test_the_picture_comes_first(window, on_demo):
     assert page.page.locator("#panel").is_hidden() == (width < 600), "a sheet gives way to the scene"
 
 
+def test_fingers_hit_every_control(window, on_demo):
+    size, touch = window
+    page = on_demo(size, **touch)
+    page.page.evaluate("nrfgs.setNotes([{ text: 'here', position: nrfgs.getCamera().target }])")
+    seen = set()
+    for tab in TABS:
+        page.tab(tab)
+        if tab == "Share":
+            page.page.click("#embed")
+            page.page.click("#copy-link")
+        for box in boxes(page, CONTROLS + ", .note button"):
+            assert box["width"] >= LARGE and box["height"] >= LARGE, box
+            seen.add(box["name"])
+        overflow = page.page.evaluate(
+            "(() => { const { scrollWidth, clientWidth } = document.getElementById('panel');"
+            " return scrollWidth - clientWidth; })()"
+        )
+        assert overflow <= 0, tab
+    assert {"home", "drag", "gain", "photograph", "copy-link", "embed", "add-note", "save-tour"} <= seen
+
+
 def devtools(page: Page):
     """Chromium's own protocol, which emulates safe areas and fingers; skips in Firefox, which has no such thing."""
     if page.is_firefox:
         pytest.skip("Firefox emulates neither safe areas nor fingers")
     return page.page.context.new_cdp_session(page.page)
+
+
+def test_controls_stay_within_the_safe_area(on_demo):
+    page = on_demo((360, 640), has_touch=True)
+    insets = {"top": 40, "bottom": 34, "left": 0, "right": 0}
+    devtools(page).send("Emulation.setSafeAreaInsetsOverride", {"insets": insets})
+    assert all(box["y"] + box["height"] <= 640 - 34 for box in boxes(page, "#bar button"))
+    page.tab("Share")
+    assert boxes(page, "#caption")[0]["y"] >= 40
 
 
 def test_every_control_changes_the_picture(window, on_demo):
@@ -227,6 +264,19 @@ def test_the_view_never_ends_inside_or_behind_the_scene(wall):
     assert page.camera()[0][0] < 19
 
 
+def test_no_frame_around_what_a_mouse_drags(wall):
+    page = wall((480, 360))
+    style = "getComputedStyle(document.getElementById('scene')).outlineStyle"
+    page.page.keyboard.press("Tab")
+    page.page.focus("#scene")
+    assert page.page.evaluate(style) == "solid", "the keyboard's place is seen"
+    page.drag()
+    assert page.page.evaluate("document.activeElement.id") == "scene"
+    assert page.page.evaluate(style) == "none"
+    page.page.keyboard.press("ArrowLeft")
+    assert page.page.evaluate(style) == "solid"
+
+
 def test_fingers_turn_move_and_zoom(on_demo):
     page = on_demo((480, 360))
     touch = devtools(page)
@@ -299,11 +349,33 @@ def test_slow_frames_make_pictures_coarser_until_the_camera_rests(wall):
 def test_whoever_cannot_see_the_page_is_told_what_is_there(on_demo):
     page = on_demo((900, 700))
     assert page.page.locator("html").get_attribute("lang") == "en"
+    for tab, roles in {
+        "View": {
+            "application": ["page: a scene in three dimensions"],
+            "heading": ["page"],
+            "slider": [re.compile("^Residual gain")],
+            "combobox": [re.compile("^Show"), re.compile("^Drag to")],
+            "checkbox": ["Freeze view", "Turn slowly"],
+            "button": [*TABS, "First view", "Full screen"],
+        },
+        "Photographs": {
+            "combobox": ["Photograph"],
+            "checkbox": ["Mark where taken"],
+            "button": ["Previous photograph", "Next photograph"],
+        },
+        "Share": {"button": ["Copy link to this view", "Save picture", "Embed in a page", "Add note", "Save tour"]},
+    }.items():
+        page.tab(tab)
+        assert page.page.get_by_role("region", name=tab, exact=True).count() == 1
+        for role, names in roles.items():
+            for name in names:
+                assert page.page.get_by_role(role, name=name, exact=isinstance(name, str)).count() == 1, name
     unnamed = page.page.evaluate(
         "[...document.querySelectorAll('button, select, input, textarea')].filter((one) => !one.labels?.length"
         " && !one.ariaLabel && !one.textContent.trim()).map((one) => one.id)"
     )
     assert unnamed == []
+
     # The keyboard alone gets everywhere, and what happens is said.
     reached = set()
     for tab in TABS:
@@ -317,3 +389,13 @@ def test_whoever_cannot_see_the_page_is_told_what_is_there(on_demo):
     assert page.page.get_by_role("status").filter(has_text=re.compile("^Photograph ")).count() == 1
     for role, expanded in (("true", "Help"), ("false", "View")):
         assert page.page.get_by_role("button", name=expanded, exact=True).get_attribute("aria-expanded") == role
+
+
+def test_pictures_for_the_docs(demo, tmp_path):
+    words = [sys.executable, "-m", "nrfgs_lab.pages.pictures", demo[1], tmp_path / "out"]
+    run = subprocess.run(words, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    written = sorted(path.name for path in (tmp_path / "out").iterdir())
+    shown = [f"{window}-{name}.jpg" for window in ("desktop", "phone") for name in ("page", "share", "view")]
+    assert written == [*shown, "web.jpg"]
+    assert all(np.asarray(Image.open(tmp_path / "out" / name)).std() > 5 for name in written)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures, exported files and the growth's statistics on a CUDA device. On a CPU their rooms test them."""
+"""The viewer's pictures and the exported files on a CUDA device. `pytest -m gpu`. On a CPU their rooms test them."""
 
 import json
+from itertools import combinations
 from pathlib import Path
 
 import pytest
@@ -9,11 +10,19 @@ import torch
 from short_trainings import command_line, trained
 
 from nrfgs_lab.training_run import evaluate, parse
-from nrfgs_ns.densification import statistics
 from nrfgs_ns.export.command import Compact, Ply
 from nrfgs_ns.export.options import PlyOptions
 from nrfgs_ns.export.ply import read_splats
-from nrfgs_ns.viewer.pictures import AMPLIFICATION, DEPTH, VIEW_DEPENDENCE, PictureOptions, legends, picture
+from nrfgs_ns.viewer.pictures import (
+    AMPLIFICATION,
+    BASE,
+    DEPTH,
+    FULL,
+    VIEW_DEPENDENCE,
+    PictureOptions,
+    legends,
+    picture,
+)
 
 pytestmark = pytest.mark.gpu
 FROZEN = "full, as seen from another camera"
@@ -21,7 +30,10 @@ STEPS = 60
 
 
 def viewer_pictures(device: str, scene: Path, out: Path) -> dict[str, torch.Tensor]:
-    """The picture of every mode, and one whose view is frozen, of a random field, the same on every device."""
+    """The picture of every mode, and one whose view is frozen, moved to the CPU.
+
+    The field is drawn at random, the same on every device.
+    """
     config = parse(["nrfgs", "--data", str(scene), "--output-dir", str(out), "--machine.device-type", device])
     config.pipeline.model.background_color = "black"
     config.pipeline.model.few_views = "off"
@@ -46,6 +58,10 @@ def viewer_pictures(device: str, scene: Path, out: Path) -> dict[str, torch.Tens
         pictures[name] = picture(model, camera, what)["rgb"]
         assert pictures[name].shape == (36, 48, 3) and pictures[name].device.type == device, name
         assert ((pictures[name] >= 0) & (pictures[name] <= 1)).all(), name  # NaN is in no interval
+    assert torch.equal(pictures[FULL], model.get_outputs_for_camera(camera)["rgb"])
+    assert torch.equal(pictures[BASE], model.get_base_color(camera))
+    for pair in combinations(pictures, 2):
+        assert (pictures[pair[0]] - pictures[pair[1]]).abs().max() > 0.02, pair
     return {name: value.cpu() for name, value in pictures.items()}
 
 
@@ -90,37 +106,3 @@ def test_every_mode(tiny_scene, tmp_path):
         # pixels have one. Changes are drawn AMPLIFICATION times as large, and viridis is less steep than 2.
         assert (error > 2 * AMPLIFICATION / 255).float().mean() < 0.01, name
         assert error.mean() < 1e-3, name
-
-
-# The growth's statistics.
-def one_view() -> dict:
-    """What a camera saw: 3000 of 5000 splats, some of them of no size."""
-    torch.manual_seed(0)
-    rows = torch.randperm(5000, device="cuda")[:3000]
-    radii = torch.randint(0, 90, (3000,), dtype=torch.int32, device="cuda")
-    return {"width": 640, "height": 480, "n_cameras": 1, "gaussian_ids": rows, "radii": radii}
-
-
-def test_one_camera_is_the_kernels(monkeypatch):
-    info = one_view()
-    info["radii"] += 1
-    state = {name: torch.zeros(5000, device="cuda") for name in ("grad2d", "count", "radii")}
-    gradients = torch.randn(3000, 2, device="cuda")
-    twin = {name: value.clone() for name, value in state.items()}
-    statistics.add_in_torch(twin, info["gaussian_ids"], gradients, info["radii"], (320.0, 240.0), 640.0)
-    monkeypatch.setattr(statistics, "add_in_torch", None)
-    statistics.take_statistics(state, info, gradients)
-    for name in state:
-        torch.testing.assert_close(state[name], twin[name], rtol=1e-6, atol=0.0)
-
-
-def test_one_cameras_maxima_are_the_kernels(monkeypatch):
-    info = one_view()
-    maxima = [torch.full((5000,), start, device="cuda") for start in (0.0, 0.0, -2.0)]
-    step = torch.randn(3000, 2, device="cuda"), torch.rand(3000, device="cuda") - 0.5
-    twin = [value.clone() for value in maxima]
-    statistics.raise_in_torch(*twin, info["gaussian_ids"], info["radii"], *step, 640.0, (640.0, 480.0))
-    monkeypatch.setattr(statistics, "raise_in_torch", None)
-    statistics.take_maxima(*maxima, info, *step)
-    for value, other in zip(maxima, twin, strict=True):
-        torch.testing.assert_close(value, other, rtol=1e-6, atol=0.0)

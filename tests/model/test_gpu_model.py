@@ -5,10 +5,29 @@ import pytest
 import torch
 from nerfstudio.engine.optimizers import Optimizers
 from short_trainings import PLAIN, SMOKE_METHODS, SMOKE_STEPS, bound, command_line
+from torch.testing import assert_close
 
 from nrfgs_lab.training_run import evaluate, parse, train
+from nrfgs_ns.appearance.sh import eval_sh
 
 pytestmark = pytest.mark.gpu
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_harmonics_kernel_against_the_torch_twin(degree):
+    torch.manual_seed(0)
+    directions, coefficients = torch.randn(500, 3), torch.randn(500, 16, 3)
+    leaves = [directions.requires_grad_(), coefficients.requires_grad_()]
+    on_gpu = [leaf.detach().cuda().requires_grad_() for leaf in leaves]
+    twin, kernel = eval_sh(degree, *leaves), eval_sh(degree, *on_gpu)
+    # 16 products of numbers around 3, each rounded at 2^-24 of itself; the kernel is compiled with fast math.
+    assert_close(kernel.cpu(), twin, rtol=0, atol=2e-5)
+    weight = torch.randn_like(twin)
+    twin.backward(weight)
+    kernel.backward(weight.cuda())
+    for cpu, gpu in zip(leaves, on_gpu, strict=True):
+        if cpu.grad is not None:
+            assert_close(gpu.grad.cpu(), cpu.grad, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("method", SMOKE_METHODS)

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The moves of MCMC in torch, against gsplat's own with its CUDA kernels."""
+
+import pytest
+import torch
+from torch.nn import Parameter
+from torch.testing import assert_close
+
+from nrfgs_ns.densification import statistics
+from nrfgs_ns.densification.relocation import add_noise, split_evenly
+
+pytestmark = pytest.mark.gpu
+
+
+def test_split_evenly_is_gsplats_relocation():
+    """gsplat adds up to 51 alternating terms in float32. At n <= 10 and o <= 0.9 their size is at most 30 times the
+    sum's (o' <= 0.9 / 4, (1 + o')^n < 8, divided by o' n / 3), so 55 terms lose at most 1e-4 of it."""
+    from gsplat.relocation import compute_relocation
+    from gsplat.strategy import MCMCStrategy
+
+    torch.manual_seed(0)
+    opacities = torch.empty(1000, device="cuda").uniform_(0.01, 0.9)
+    scales = torch.empty(1000, 3, device="cuda").uniform_(0.001, 1.0)
+    copies = torch.randint(1, 11, (1000,), device="cuda")
+    binoms = MCMCStrategy().initialize_state()["binoms"].cuda()
+    theirs = compute_relocation(opacities, scales, copies.clone(), binoms)
+    ours = split_evenly(opacities, scales, copies)
+    assert_close(ours[0], theirs[0], rtol=1e-4, atol=0)
+    assert_close(ours[1], theirs[1], rtol=1e-4, atol=0)
+
+
+def test_diffuse_is_gsplats_noise():
+    from gsplat.strategy.ops import inject_noise_to_position
+
+    torch.manual_seed(0)
+    count = 1000
+    start = {
+        "means": torch.zeros(count, 3),
+        "quats": torch.randn(count, 4),
+        "scales": torch.randn(count, 3),
+        "opacities": torch.empty(count, 1).uniform_(-7.0, -4.0),
+    }
+    results = []
+    for move in (
+        lambda splats: add_noise(splats, 0.1, torch.sigmoid(splats["opacities"].flatten())),
+        lambda splats: inject_noise_to_position(splats, {}, {}, scaler=0.1),
+    ):
+        splats = {name: Parameter(value.cuda()) for name, value in start.items()}
+        torch.manual_seed(1)
+        with torch.no_grad():
+            move(splats)
+        results.append(splats["means"].detach())
+    # Sums of nine products in float32, in another order: 1e-6 of the largest.
+    assert_close(results[0], results[1], rtol=1e-4, atol=1e-6 * results[1].abs().max().item())
+
+
+def one_view() -> dict:
+    """What a camera saw: 3000 of 5000 splats, some of them of no size."""
+    torch.manual_seed(0)
+    rows = torch.randperm(5000, device="cuda")[:3000]
+    radii = torch.randint(0, 90, (3000,), dtype=torch.int32, device="cuda")
+    return {"width": 640, "height": 480, "n_cameras": 1, "gaussian_ids": rows, "radii": radii}
+
+
+def test_one_camera_is_the_kernels(monkeypatch):
+    info = one_view()
+    info["radii"] += 1
+    state = {name: torch.zeros(5000, device="cuda") for name in ("grad2d", "count", "radii")}
+    gradients = torch.randn(3000, 2, device="cuda")
+    twin = {name: value.clone() for name, value in state.items()}
+    statistics.add_in_torch(twin, info["gaussian_ids"], gradients, info["radii"], (320.0, 240.0), 640.0)
+    monkeypatch.setattr(statistics, "add_in_torch", None)
+    statistics.take_statistics(state, info, gradients)
+    for name in state:
+        torch.testing.assert_close(state[name], twin[name], rtol=1e-6, atol=0.0)
+
+
+def test_one_cameras_maxima_are_the_kernels(monkeypatch):
+    info = one_view()
+    maxima = [torch.full((5000,), start, device="cuda") for start in (0.0, 0.0, -2.0)]
+    step = torch.randn(3000, 2, device="cuda"), torch.rand(3000, device="cuda") - 0.5
+    twin = [value.clone() for value in maxima]
+    statistics.raise_in_torch(*twin, info["gaussian_ids"], info["radii"], *step, 640.0, (640.0, 480.0))
+    monkeypatch.setattr(statistics, "raise_in_torch", None)
+    statistics.take_maxima(*maxima, info, *step)
+    for value, other in zip(maxima, twin, strict=True):
+        torch.testing.assert_close(value, other, rtol=1e-6, atol=0.0)
