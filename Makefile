@@ -6,7 +6,7 @@ DEMO_ARGS ?=
 # uv, not pip: it can leave out the dependencies that need a compiler (requirements.override).
 INSTALL := $(BIN)/uv pip install --quiet --system-certs --python $(BIN)/python --constraint requirements.lock --override requirements.override
 
-.PHONY: demo test test-slow test-browser lint clean
+.PHONY: demo test test-slow test-browser lint site clean
 
 demo: $(VENV)/.installed  ## make a scene, train the field on it, show what it adds
 	$(BIN)/nrfgs demo $(DEMO_ARGS)
@@ -23,6 +23,10 @@ test-browser: $(VENV)/.installed  ## exported pages in Chromium and in Firefox (
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check . && $(BIN)/ruff format --check .
+
+site: $(VENV)/.installed  ## the pages as a site, in site/
+	$(INSTALL) --editable '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 $(VENV)/.installed: pyproject.toml requirements.lock requirements.override
 	$(PYTHON) -m venv $(VENV)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from nrfgs_lab.pages import tables
+from nrfgs_lab.pages import site, tables
 from nrfgs_lab.pages.figures import FIGURES
 from nrfgs_lab.pages.tables import BLOCK, BLOCKS, ROOT, SHEET, declared, pages, written
 
@@ -45,6 +45,13 @@ def test_links_lead_to_files_and_headings_that_are_there(name):
         assert target.is_relative_to(ROOT), f"{link} leads out of the repository"
         if anchor:
             assert anchor in anchors(target.read_text(encoding="utf-8")), link
+
+
+def test_the_site_has_every_page_and_no_link_out_of_it():
+    nav = re.findall(r"[\w-]+\.md", (ROOT / "mkdocs.yml").read_text().partition("nav:")[2])
+    assert sorted(nav) == sorted(["index.md", *(path.name for path in (ROOT / "docs").glob("*.md"))])
+    for text in PAGES.values():
+        assert not re.search(r"\]\(\.\./", site.on_page_markdown(text))
 
 
 def test_a_number_that_is_not_the_record_s_is_noticed():
