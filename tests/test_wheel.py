@@ -23,9 +23,9 @@ from nrfgs_ns import __version__
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("nrfgs_ns", "nrfgs_prepare", "nrfgs_lab")
 BUILT_FROM = ("pyproject.toml", "README.md", "LICENSE", *PACKAGES)
-EXTRAS = ("", "dev", "kernels", "heic", "lab", "flip", "browser")
-LOCKED = ("", "dev", "heic", "lab", "browser")
-HOSTS = {"nerfbaselines"}
+EXTRAS = ("", "dev", "kernels", "heic", "lab", "flip", "browser", "docs")
+LOCKED = ("", "dev", "heic", "lab", "browser", "docs")
+HOSTS = {"nerfbaselines", "mkdocs"}
 """Packages that import ours, which then import them."""
 
 
