@@ -219,7 +219,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         pictures = in_parallel(lambda index: read(dataset, index, kind), sizes, f"Reading {split} images", workers)
         images = [placed(data) for data in pictures]
         # Undistorted images are a pinhole's, whatever the lens.
-        dataset.cameras.camera_type[:] = CameraType.PERSPECTIVE.value
+        dataset.cameras.camera_type = torch.full_like(dataset.cameras.camera_type, CameraType.PERSPECTIVE.value)
         self.train_cameras = self.train_dataset.cameras.to(self.device if place == "device" else "cpu")
         return images
 
