@@ -62,7 +62,7 @@ def failed_views(pipeline) -> dict[str, dict[str, float]]:
     return result
 
 
-def main(config: Path) -> None:
+def main(config: tyro.conf.Positional[Path]) -> None:
     """Print the PSNR of each test view with suspects left out.
 
     Args:

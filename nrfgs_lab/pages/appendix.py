@@ -18,7 +18,6 @@ RIVALS = {
 GAPS = {
     "**twice the residual, on the logit**: `nrfgs`": "twice on the logit",
     "residual on the logit": "on the logit",
-    "dead by the stored opacity": "dead by the stored opacity",
     "harmonics, same rules": "harmonics",
 }
 """Label -> trial with gaps in results/trials.json; its default added the residual to the opacity."""
@@ -34,8 +33,6 @@ RULES = {
     "**by error, points from photographs, near plane**": "by error, dense start, near plane",
     "without the near plane": "by error, dense start",
     "without points from photographs": "by error, near plane",
-    "weight of SSIM 0.3 instead of 0.2": "default: SSIM 0.3",
-    "3DGS's rules, points from photographs, near plane": "3DGS's rules, dense start, near plane",
 }
 """Label -> trial in results/trials.json."""
 BASE = "splatfacto's rules"
