@@ -109,3 +109,13 @@ def test_kernels_that_fail_are_told_apart(monkeypatch):
 @pytest.mark.gpu
 def test_all_kernels_run_on_this_gpu():
     assert [finding.fix for finding in doctor.kernels(torch.device("cuda"))] == ["", ""]
+
+
+def test_a_gpu_is_named_with_its_memory(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "H100")
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (12e9, 80e9))
+    monkeypatch.setattr(doctor, "kernels", lambda device: [doctor.Finding("kernels", str(device))])
+    gpu, kernels = [finding for finding in doctor.machine() if finding.name != "LPIPS"]
+    assert all(part in gpu.state for part in ("H100", "12.0", "80.0")) and not gpu.fix and kernels.state == "cuda:0"

@@ -21,6 +21,7 @@ from PIL import Image
 from nrfgs_lab.bench.spec import Scene
 from nrfgs_ns.data.checks import find_colmap
 from nrfgs_ns.data.colmap import read_model
+from nrfgs_ns.data.pictures import read_mask, read_picture
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import whole, write_whole
@@ -42,12 +43,13 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
         with FileLock(mirror.with_name(f"{mirror.name}.lock")):
             if not (mirror / "transforms.json").exists():
                 select_views(folder, mirror, scene)
-                write_smaller(mirror, mirror, scene)
+            write_smaller(mirror, mirror, scene.downscale)
         return ["nrfgs-data", "--data", str(mirror), *scale, *scene.options]
     if (folder / "transforms.json").is_file():
         split = [] if names_its_split(folder / "transforms.json") else ["--eval-mode", "interval"]
+        mirror = mirror.with_name(f"{mirror.name} in {scene.downscale}")
         with FileLock(mirror.with_name(f"{mirror.name}.lock")):
-            folder = write_smaller(folder, mirror, scene)
+            folder = write_smaller(folder, mirror, scene.downscale)
         return ["nrfgs-data", "--data", str(folder), *split, *scale, *scene.options]
     model = find_colmap(folder)
     if model is None:
@@ -123,25 +125,33 @@ def _halve(meta: dict, folder: Path, out: Path) -> None:
         shutil.copy(folder / meta["ply_file_path"], out / meta["ply_file_path"])
 
 
-def write_smaller(folder: Path, mirror: Path, scene: Scene) -> Path:
-    """The folder of a data set with images at the scene's `downscale`: `folder` if it needs none, or has them, else
-    `mirror`, in which they are written as `nrfgs-data` would resize them, beside links to the rest."""
-    if scene.downscale is None or (folder / f"images_{scene.downscale}").is_dir():
+def write_smaller(folder: Path, mirror: Path, downscale: int | None) -> Path:
+    """The folder of a data set with images at a smaller size: `folder` if it has them or needs none, else `mirror`, in
+    which they are written as `nrfgs-data` would resize them, beside links to the rest. A data set that `nrfgs-data`
+    refuses is left to it."""
+    smaller = folder / f"images_{downscale}"
+    if downscale is None or smaller.is_symlink() or (folder != mirror and smaller.is_dir()):
         return folder
-    meta = json.loads((folder / "transforms.json").read_text(encoding="utf-8"))
-    kinds = {"file_path": ("images", Image.Resampling.LANCZOS), "mask_path": ("masks", Image.Resampling.NEAREST)}
+    try:
+        frames = json.loads((folder / "transforms.json").read_bytes()).get("frames", [])
+    except (OSError, ValueError):
+        return folder
+    names = {key: [frame[key] for frame in frames if key in frame] for key in ("file_path", "mask_path")}
+    if any(len({Path(name).name for name in of_kind}) < len(set(of_kind)) for of_kind in names.values()):
+        return folder
     mirror.mkdir(parents=True, exist_ok=True)
     for entry in folder.iterdir():
         if not (mirror / entry.name).exists():
             (mirror / entry.name).symlink_to(entry.resolve())
-    for frame in meta.get("frames", []):
-        for key in kinds.keys() & frame.keys():
-            name, sampling = kinds[key]
-            target = mirror / f"{name}_{scene.downscale}" / Path(frame[key]).name
+    kinds = ("file_path", "images", read_picture, "LANCZOS"), ("mask_path", "masks", read_mask, "NEAREST")
+    for key, kind, read, sampling in kinds:
+        for name in names[key]:
+            target = mirror / f"{kind}_{downscale}" / Path(name).name
             if not target.exists():
-                with Image.open(folder / frame[key]) as picture, whole(target) as aside:
-                    size = [side // scene.downscale for side in picture.size]
-                    picture.resize(size, sampling).save(aside, "PNG")  # lossless, whatever the name says
+                picture = read(folder / name)
+                small = picture.resize([side // downscale for side in picture.size], Image.Resampling[sampling])
+                with Image.open(folder / name) as original, whole(target) as aside:
+                    small.save(aside, "PNG", exif=original.getexif())  # lossless, whatever the name says
     return mirror
 
 

@@ -216,7 +216,8 @@ class Densification(ABC):
         """How many of `wanted` more splats the GPU has memory for. Called in every refinement that may grow.
 
         Where it is fewer, and the limit near, a line says so, and the number then reached is the training's limit: it
-        is in checkpoints, so that a continued training has the same, unless it has more memory, or less.
+        is in checkpoints, so that a continued training has the same, unless it has more memory, or less. Before it is
+        near, memory may slow growth, which a continued training need not repeat to the bit.
         """
         count, within = len(splats["means"]), self.least(memory.allowed(splats["means"].device))
         if self.state[HELD] is None or self.state[HELD][1] != within:

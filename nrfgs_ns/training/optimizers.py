@@ -101,8 +101,11 @@ class LeanOptimizers(Optimizers):
     def load_optimizers(self, loaded_state) -> None:
         """Load the moments; options such as learning rates stay this training's."""
         for name, state in loaded_state.items():
-            own = self.optimizers[name].state_dict()["param_groups"]
-            self.optimizers[name].load_state_dict({**state, "param_groups": own})
+            groups = self.optimizers[name].param_groups
+            own = [{key: value for key, value in group.items() if key != "params"} for group in groups]
+            self.optimizers[name].load_state_dict(state)
+            for group, options in zip(self.optimizers[name].param_groups, own, strict=True):
+                group.update(options)
         self.fuse()
 
     def load_schedulers(self, loaded_state) -> None:

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Captures in coordinates of the earth, and whether cameras see what training starts from."""
 
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -58,6 +60,20 @@ def test_an_applied_transform_is_part_of_the_way_back(tmp_path):
     back, origin = to_capture(outputs)
     found = back.places(outputs.metadata["points3D_xyz"]) + origin
     np.testing.assert_allclose(found, (xyz - (3, 4, 5)) @ np.array(far.meta["applied_transform"])[:, :3], atol=1e-5)
+
+
+def test_what_nerfstudio_writes_beside_the_checkpoints_leads_back(tmp_path):
+    far, xyz = with_points(tmp_path / "far", UTM)
+    outputs = far.parse()
+    outputs.save_dataparser_transform(tmp_path / "dataparser_transforms.json")
+    saved = json.loads((tmp_path / "dataparser_transforms.json").read_text())
+    transform, scale = np.array(saved["transform"]), saved["scale"]
+    back = (outputs.metadata["points3D_xyz"].numpy() / scale - transform[:, 3]) @ transform[:, :3]
+    np.testing.assert_allclose(back, xyz, atol=1e-5, rtol=0)
+    poses = outputs.transform_poses_to_original_space(outputs.cameras.camera_to_worlds, "opengl")
+    truth = {frame["file_path"][-7:]: np.array(frame["transform_matrix"]) for frame in far.meta["frames"]}
+    for path, pose in zip(outputs.image_filenames, poses.numpy(), strict=True):
+        np.testing.assert_allclose(pose, truth[path.name][:3], atol=1e-5, rtol=0)
 
 
 # What the cameras see.

@@ -95,6 +95,17 @@ def test_growth_ends_where_memory_does(name, monkeypatch, capsys):
     assert len(table) > 41
 
 
+def test_a_far_estimate_bounds_a_refinement_alone(monkeypatch, capsys):
+    """Of several devices the one with the most splats says whether the limit is near."""
+    table, rules = Table(40), strategy("error-guided")
+    monkeypatch.setattr(memory, "most_splats", lambda *_: 50)
+    assert rules.fitting(REFINES, table.info(), table.splats, table.optimizers, 30) == 10
+    assert rules.state[HELD] is None and not capsys.readouterr().out
+    monkeypatch.setattr(rules, "least", lambda number: number - 8 if number < 0 else number)  # another has 48
+    assert rules.fitting(REFINES, table.info(), table.splats, table.optimizers, 30) == 10
+    assert rules.state[HELD] == (50, 0)
+
+
 @pytest.mark.parametrize("name", ["error-guided", "mcmc"])
 def test_what_does_not_grow_does_not_end_growth(name, monkeypatch, capsys):
     """A card has memory for 600 splats beside images that take as much as 400, which the estimate counts as growing."""

@@ -55,7 +55,7 @@ def test_losses(results):
         agree(name, mine, theirs)
 
 
-def test_gradients_of_splats_arrive_where_they_live_and_those_of_shared_weights_are_whole(results):
+def test_gradients_of_splats_arrive_where_they_live(results):
     first, second, alone = results
     assert alone["gradients"].keys() == first["gradients"].keys()
     for name, theirs in alone["gradients"].items():
@@ -63,6 +63,19 @@ def test_gradients_of_splats_arrive_where_they_live_and_those_of_shared_weights_
         for rank, ours in enumerate((first, second)):
             agree(name, ours["splats"][name], alone["splats"][name][rank::2])
             agree(name, ours["gradients"][name], theirs[rank::2])
+
+
+def test_gradients_of_shared_weights_are_whole(results):
+    first, second, alone = results
+    for name, theirs in alone["shared"].items():
+        for ours in (first, second):
+            assert (ours["shared"][name] is None) == (theirs is None), name
+            if theirs is not None:
+                agree(name, ours["shared"][name], theirs)
+    learning = [name for name, value in alone["shared"].items() if value is not None and float(value.abs().max()) > 0]
+    assert any("head" in name for name in learning)
+    if any("camera_opt" in name for name in alone["shared"]):
+        assert any("camera_opt" in name for name in learning)
 
 
 def test_statistics_of_densification_are_those_of_single_views(results):

@@ -20,7 +20,7 @@ from nrfgs_lab.training_run import evaluate
 from nrfgs_ns.appearance import gsnb, sg
 from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.training import progress
+from nrfgs_ns.training import progress, trainer_config
 from nrfgs_ns.training.checkpoint_files import read_latest
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -177,3 +177,15 @@ def test_a_training_with_the_line_is_the_one_without(tiny_scene, tmp_path, monke
         for line in said.getvalue().splitlines()
     ]
     assert [int(line[1]) for line in lines] == [*range(7, 13), 12] and len({line[3] for line in lines}) == 1
+
+
+def test_the_size_of_large_or_smaller_photographs_is_said(tiny_scene, tmp_path, monkeypatch, capsys):
+    args = command_line("nrfgs", tiny_scene, tmp_path, 2, {"--data": None, "--pipeline.model.num-downscales": 0})
+    lines = []
+    for factor, most in (("1", 1600), ("2", 1600), ("1", 10)):
+        monkeypatch.setattr(trainer_config, "MAX_AUTO_RESOLUTION", most)
+        set_up([*args, "nrfgs-data", "--data", str(tiny_scene), "--downscale-factor", factor])
+        lines.append([line for line in capsys.readouterr().out.splitlines() if line.startswith("Images are read")])
+    where = "(--downscale-factor: docs/own-data.md)."
+    half, full = (f"Images are read at {size} {where}" for size in ("1/2 of their size, 24 x 18", "full size, 48 x 36"))
+    assert lines == [[], [half], [full]]

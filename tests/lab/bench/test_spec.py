@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from nerfstudio.utils.eval_utils import eval_setup  # noqa: F401  (registers the data parsers once, before the timing)
-from PIL import Image
+from PIL import ExifTags, Image
 from small_colmap import Model
 
 from nrfgs_lab.bench.data import held_out_views, parser_options
@@ -19,6 +19,7 @@ from nrfgs_lab.bench.spec import PRESET_STEPS, Scene, Spec, cells_of, steps_of
 from nrfgs_lab.pages.methods import HEADS, best_trial
 from nrfgs_lab.pages.options import methods
 from nrfgs_lab.training_run import parse
+from nrfgs_ns.data.pictures import read_exif
 from nrfgs_ns.densification import ErrorGuided, Mcmc
 from nrfgs_ns.errors import InputError
 
@@ -240,15 +241,35 @@ def test_held_out_scenes_have_no_test_view_and_the_same_cameras_at_half_the_size
         parser_options(source.parent, Scene("tiny", held_out=3), tmp_path / "mirrors")
 
 
-def test_smaller_images_are_there_for_methods_that_only_read_them(tiny_scene, tmp_path):
-    """Equal to those that `nrfgs-data` resizes itself."""
-    resized = load(["nrfgs-data", "--data", str(tiny_scene), "--downscale-factor", "2"]).train_dataset
-    data = load(parser_options(tiny_scene.parent, Scene(tiny_scene.name, downscale=2), tmp_path / "mirrors"))
-    read = data.train_dataset
+@pytest.mark.parametrize("views", [None, 4])
+def test_smaller_images_are_there_for_methods_that_only_read_them(views, tiny_scene, tmp_path):
+    """Equal to those that `nrfgs-data` resizes itself, of any mode, with masks and EXIF; broken-off work goes on."""
+    source = tmp_path / "captures" / "tiny"
+    shutil.copytree(tiny_scene, source)
+    meta = json.loads((source / "transforms.json").read_text())
+    names = sorted(frame["file_path"] for frame in meta["frames"])
+    meta |= {"train_filenames": names[1:], "test_filenames": names[:1]}
+    for number, frame in enumerate(meta["frames"]):
+        with Image.open(source / frame["file_path"]) as picture:
+            exif = picture.getexif()
+            exif[ExifTags.Base.Model] = "camera"
+            picture.convert("P" if number % 2 else "RGB").save(source / frame["file_path"], exif=exif)
+            frame["mask_path"] = f"masks/{number}.png"
+            (source / "masks").mkdir(exist_ok=True)
+            picture.convert("L").point(lambda value: 255 * (value > 99)).save(source / frame["mask_path"])
+    (source / "transforms.json").write_text(json.dumps(meta))
+    scene = Scene("tiny", downscale=2, views=views)
+    resized = load(["nrfgs-data", "--data", str(source), "--downscale-factor", "2"]).train_dataset
+    folder = Path(parser_options(source.parent, scene, tmp_path / "mirrors")[2])
+    (folder / "images_2" / Path(names[3]).name).unlink()
+    read = load(parser_options(source.parent, scene, tmp_path / "mirrors")).train_dataset
     assert {path.parent.name for path in read.image_filenames} == {"images_2"}
-    for index in range(len(read)):
-        assert (read.get_numpy_image(index) == resized.get_numpy_image(index)).all()
-    assert not (tiny_scene / "images_2").exists()
+    twins = {path.name: index for index, path in enumerate(resized.image_filenames)}
+    for index, path in enumerate(read.image_filenames):
+        mine, theirs = read.get_data(index, "uint8"), resized.get_data(twins[path.name], "uint8")
+        assert (mine["image"] == theirs["image"]).all() and (mine["mask"] == theirs["mask"]).all()
+        assert read_exif(path)["model"] == "camera"
+    assert not (source / "images_2").exists()
 
 
 def test_compared_heads_have_what_held_out_views_chose():
