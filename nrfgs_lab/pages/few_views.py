@@ -133,11 +133,16 @@ def summary(*place: str) -> str:
     return f"{mean(runs, 'psnr'):.2f} dB, {mean(runs, 'ssim'):.3f}, {mean(runs, 'splats') / 1000:.0f}k splats"
 
 
+def sparse_runs(scene: str) -> list[Trainings]:
+    """The protocol of 24 views: the field's trainings and those of harmonics with its rules."""
+    return [trainings("twenty-four", scene, name, OWN) for name in (FIELD, "harmonics__same_rules")]
+
+
 def sparse() -> str:
     """The protocol of 24 views: the field, harmonics, the verdict, and 3DGS's published PSNR."""
     body = []
     for scene, (views, published) in SPARSE.items():
-        runs = [trainings("twenty-four", scene, name, OWN) for name in (FIELD, "harmonics__same_rules")]
+        runs = sparse_runs(scene)
         gains = view_gains(*runs)
         label = f"{scene.rpartition('_')[2]}, {views}"
         body.append([label, *map(cell, runs), f"{verdict(gains)}: {_ahead(gains)}", published])

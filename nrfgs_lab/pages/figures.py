@@ -7,7 +7,7 @@ python -m nrfgs_lab.pages.figures            # writes docs/images/views.svg
 import math
 from statistics import median
 
-from nrfgs_lab.pages.few_views import FIELD, SAME, today
+from nrfgs_lab.pages.few_views import FIELD, SAME, sparse_runs, today
 from nrfgs_lab.pages.runs import ROOT, VIEWS, view_gains
 from nrfgs_ns.files import write_whole
 
@@ -20,7 +20,9 @@ STYLE = """text { font: 15px sans-serif; fill: #1f2328 } .rule { stroke: #59636e
 
 def views() -> str:
     """Gain of the field over harmonics with the same rules in each test view, a dot each; bars are medians."""
-    gains = {scene: view_gains(today(scene, FIELD), today(scene, SAME)) for scene in VIEWS}
+    rows = {(views, scene): (today(scene, FIELD), today(scene, SAME)) for scene, views in VIEWS.items()}
+    rows[24, "bonsai"] = sparse_runs("24_views_bonsai")
+    gains = {f"{scene}, {views}": view_gains(*rows[views, scene]) for views, scene in sorted(rows, reverse=True)}
     least, most = (math.floor(min(map(min, gains.values()))), math.ceil(max(map(max, gains.values()))))
     height = ROW * len(gains) + 50
 
@@ -28,9 +30,9 @@ def views() -> str:
         return round(LEFT + (gain - least) / (most - least) * (WIDTH - LEFT - 15), 1)
 
     parts = [f'<line class="faint" x1="{x(g)}" x2="{x(g)}" y1="8" y2="{height - 42}"/>' for g in range(least, most + 1)]
-    for row, (scene, values) in enumerate(gains.items()):
+    for row, (label, values) in enumerate(gains.items()):
         y, middle = ROW * row + 25, x(median(values))
-        parts.append(f'<text x="4" y="{y + 5}">{scene}, {VIEWS[scene]}</text>')
+        parts.append(f'<text x="4" y="{y + 5}">{label}</text>')
         kinds = ((value, "better" if value > 0 else "worse") for value in values)
         parts += [f'<circle class="{kind}" cx="{x(v)}" cy="{y}" r="5" fill-opacity="0.55"/>' for v, kind in kinds]
         parts.append(f'<line class="rule" stroke-width="3" x1="{middle}" x2="{middle}" y1="{y - 12}" y2="{y + 12}"/>')
