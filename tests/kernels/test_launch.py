@@ -4,13 +4,14 @@
 import os
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 import torch
 from packaging.version import Version
 
-triton = pytest.importorskip("triton")
+pytest.importorskip("triton")
 
 from nrfgs_ns.kernels import launch as module
 from nrfgs_ns.kernels.launch import Launcher
@@ -96,7 +97,7 @@ TESTS = Path(__file__).parents[1]
 
 
 @pytest.mark.skipif(
-    Version(triton.__version__) < Version("3.4"),
+    Version(version("triton")) < Version("3.4"),
     reason="before 3.4 Triton's interpreter has neither products of fewer than 16 rows (3.2) nor single bits (3.3)",
 )
 def test_kernels_in_the_interpreter():
