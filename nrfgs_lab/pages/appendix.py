@@ -2,6 +2,7 @@
 """Blocks of docs/tables.md: what the sentences of other pages rest on."""
 
 from collections import defaultdict
+from collections.abc import Iterator
 from statistics import fmean, median, stdev
 
 from nrfgs_lab.pages.few_views import FEW, FIELD, SAME, SHRUNK, cell, runs_of, today, views_of
@@ -138,19 +139,22 @@ def logit() -> str:
 
 
 def scale() -> str:
-    """Steps after growth: milliseconds, those of the GPU's work, and gigabytes at the peak, medians of repeats."""
-    columns = {"step_ms": (1, ".2f"), "gpu_ms": (1, ".2f"), "peak_mb": (0.001, ".1f")}
-    cells, body = {column: scale_cells(column) for column in columns}, []
-    for count, pixels in cells["step_ms"]:
-        values = (
-            "/".join(
-                format(median(cells[column][count, pixels][renderer]) * factor, form)
-                for column, (factor, form) in columns.items()
-            )
-            for renderer in RENDERERS
-        )
-        body.append([f"{count / 1e6:g}M, {pixels:g} MP", *values])
-    return grid(["splats, image", *RENDERERS.values()], body)
+    """Steps after growth: milliseconds, those of the GPU's work, and gigabytes at the peak; then frames per second at
+    1080p and 4K. Medians of repeats."""
+
+    def rows(label: str, columns: dict[str, tuple[float, str]]) -> Iterator[list[str]]:
+        cells = {column: scale_cells(column) for column in columns}
+
+        def value(place: tuple[float, float], renderer: str) -> str:
+            medians = {column: median(cells[column][place][renderer]) for column in columns}
+            return "/".join(format(medians[column] * factor, form) for column, (factor, form) in columns.items())
+
+        for place in next(iter(cells.values())):
+            yield [label.format(place[0] / 1e6, place[1]), *(value(place, renderer) for renderer in RENDERERS)]
+
+    steps = rows("{:g}M, {:g} MP", {"step_ms": (1, ".2f"), "gpu_ms": (1, ".2f"), "peak_mb": (0.001, ".1f")})
+    frames = rows("{:g}M, frames", {"1080p": (1, ".0f"), "4K": (1, ".0f")})
+    return grid(["splats, image", *RENDERERS.values()], [*steps, *frames])
 
 
 BLOCKS = {

@@ -84,12 +84,6 @@ def scale_cells(column: str) -> dict[tuple[int, float], dict[str, list[float]]]:
     return dict(sorted(places.items()))
 
 
-def scale_frames(splats: str) -> str:
-    """Frames per second at 1080p, medians of repeats."""
-    (cells,) = (one for (count, _), one in scale_cells("1080p").items() if count == float(splats))
-    return ", ".join(f"{name} {median(cells[one]):.0f}" for one, name in RENDERERS.items()).replace(", bare", " (bare)")
-
-
 def scale_ratios() -> str:
     """Least and most that a step of `nrfgs` has of another renderer's time over the table's cells."""
     cells, parts = scale_cells("step_ms").values(), []
@@ -108,6 +102,6 @@ def scale_fit(column: str, factor: str, unit: str, renderer: str) -> str:
 
 
 BLOCKS = {
-    **{f"speed.{block.__name__}": block for block in (ratio, scale_fit, scale_frames, scale_ratios)},
+    **{f"speed.{block.__name__}": block for block in (ratio, scale_fit, scale_ratios)},
     "trade_off.presets": presets,
 }
