@@ -8,13 +8,14 @@ It takes the options of `ns-train`, for one machine.
 """
 
 import contextlib
+import socket
 import sys
 
 import torch
 import torch.distributed as dist
 import torch.multiprocessing as mp
 from nerfstudio.engine.trainer import TrainerConfig
-from nerfstudio.scripts.train import DEFAULT_TIMEOUT, _find_free_port, train_loop
+from nerfstudio.scripts.train import DEFAULT_TIMEOUT, train_loop
 from nerfstudio.utils import comms
 
 from nrfgs_lab.training_run import parse
@@ -38,6 +39,13 @@ def join_group(rank: int, world: int, url: str, device_type: str) -> None:
     comms.LOCAL_PROCESS_GROUP = dist.new_group()
 
 
+def free_port() -> int:
+    """A port of this machine that nothing listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
 if __name__ == "__main__":
     config = parse(sys.argv[1:])
     if config.machine.num_machines > 1:
@@ -45,4 +53,4 @@ if __name__ == "__main__":
     config.save_config()
     explain_losses(config)
     with contextlib.suppress(KeyboardInterrupt):  # the processes hear Ctrl-C, too: Python waits for their last step
-        mp.spawn(work, args=(config, f"tcp://127.0.0.1:{_find_free_port()}"), nprocs=config.machine.num_devices)
+        mp.spawn(work, args=(config, f"tcp://127.0.0.1:{free_port()}"), nprocs=config.machine.num_devices)

@@ -47,9 +47,10 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
         return ["nrfgs-data", "--data", str(mirror), *scale, *scene.options]
     if (folder / "transforms.json").is_file():
         split = [] if names_its_split(folder / "transforms.json") else ["--eval-mode", "interval"]
-        mirror = mirror.with_name(f"{mirror.name} in {scene.downscale}")
-        with FileLock(mirror.with_name(f"{mirror.name}.lock")):
-            folder = write_smaller(folder, mirror, scene.downscale)
+        if scene.downscale is not None:
+            mirror = mirror.with_name(f"{mirror.name} in {scene.downscale}")
+            with FileLock(mirror.with_name(f"{mirror.name}.lock")):
+                folder = write_smaller(folder, mirror, scene.downscale)
         return ["nrfgs-data", "--data", str(folder), *split, *scale, *scene.options]
     model = find_colmap(folder)
     if model is None:

@@ -20,10 +20,9 @@ import torch.distributed as dist
 import torch.multiprocessing as mp
 import tyro
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-from nerfstudio.scripts.train import _find_free_port
 
 from nrfgs_lab.bench.spec import QUIET
-from nrfgs_lab.many_processes import join_group
+from nrfgs_lab.many_processes import free_port, join_group
 from nrfgs_lab.training_run import machine, parse, synchronize
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.model import initial_splats
@@ -53,7 +52,7 @@ class Load:
         runs = []
         for world in self.devices:
             with tempfile.TemporaryDirectory() as folder:
-                url = f"tcp://127.0.0.1:{_find_free_port()}"
+                url = f"tcp://127.0.0.1:{free_port()}"
                 mp.spawn(one_device, args=(self, world, url, folder), nprocs=world)
                 parts = [json.loads(Path(folder, f"{rank}.json").read_text()) for rank in range(world)]
             seconds = max(part["seconds"] for part in parts)

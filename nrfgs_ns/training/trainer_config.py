@@ -176,17 +176,16 @@ def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool)
     parts += ["view dependence reduced, as suits few views"] if model.trust < FEW else []
     rounded = (f"{name} {round(value, 3) if isinstance(value, float) else value}" for name, value in suited.items())
     offset, near = model.noise_factor * model.camera_spacing / unit, model.near / unit
-    chosen = {
-        f"steps: {STEPS_PER_VIEW} a view, at least {FEWEST_STEPS:,} and at most {STEPS:,}": steps_are_chosen,
-        f"trust in view dependence: {model.trust:.2g} of 1": model.trust < 1.0,
-        f"head, by views and densification: {', '.join(rounded)}": bool(suited),
-        f"noise on the camera centre in training: about {offset:.2g} scene units, {model.noise_factor:.2g} times the "
-        "distance between neighbouring cameras": model.view_noise.sigma > 0.0,
-        f"near plane: {near:.2g} scene units, half the depth of the nearest points": (
-            model.config.near_plane == "auto" and model.near > 0.0
-        ),
-    }
-    notes = [*pipeline.notes, *(note for note, holds in chosen.items() if holds)]
+    noise = f"about {offset:.2g} scene units, {model.noise_factor:.2g} times the distance between neighbouring cameras"
+    has_near_plane = model.config.near_plane == "auto" and model.near > 0.0
+    chosen = (
+        (steps_are_chosen, f"steps: {STEPS_PER_VIEW} a view, at least {FEWEST_STEPS:,} and at most {STEPS:,}"),
+        (model.trust < 1.0, f"trust in view dependence: {model.trust:.2g} of 1"),
+        (suited, f"head, by views and densification: {', '.join(rounded)}"),
+        (model.view_noise.sigma > 0.0, f"noise on the camera centre in training: {noise}"),
+        (has_near_plane, f"near plane: {near:.2g} scene units, half the depth of the nearest points"),
+    )
+    notes = [*pipeline.notes, *(note for holds, note in chosen if holds)]
     one = f"{given} training view{'s' * (given != 1)}"
     count = one if views == given else f"{views} different training views of {given}"
     if parts:

@@ -46,6 +46,15 @@ def test_morton_interleaves_and_back(seed, count):
         assert by_hand == int(number)
 
 
+@given(seed=st.integers(0, 99))
+def test_grids_are_half_a_step_off_at_most(seed):
+    random = np.random.default_rng(seed)
+    values = random.normal(size=(30, 3)) * 10.0 ** random.uniform(-4, 4, 3)
+    grid = Grid(values.min(axis=0), np.full(3, 0.3))
+    rounding = 4 * np.finfo(float).eps * np.abs(values).max(axis=0)
+    assert (np.abs(grid.values(grid.codes(values)) - values) <= grid.step / 2 + rounding).all()
+
+
 def ellipsoids(quats, scales):
     """R S R^T, [N, 3, 3]."""
     turns = Rotation.from_quat(np.roll(quats, -1, axis=1)).as_matrix()
@@ -90,17 +99,12 @@ def test_every_number_comes_back_within_half_a_step(tmp_path):
     assert decoded.config == replace(one.head.config, opacity_bound=one.head.config.bound)
 
 
-def test_splats_are_in_morton_order_the_file_is_small_and_may_hold_large_weights_and_a_lone_splat(tmp_path):
+def test_splats_are_in_morton_order_and_the_file_is_small(tmp_path):
     decoded = through_a_file(field(3000), tmp_path)
     grid = Grid(*(np.array(decoded.header["grids"]["means"][part]) for part in ("low", "step")))
     assert (np.diff(morton(grid.codes(decoded.splats["means"].double().numpy())).astype(np.int64)) >= 0).all()
     size = (tmp_path / "f.nrf").stat().st_size
     assert size < 248 * 3000 / 10, "random splats already take a tenth of a PLY file"
-    one = field(1)
-    one.head.low[0].weight[0, 0] = 1e6  # beyond float16
-    decoded = through_a_file(one, tmp_path)
-    assert decoded.weights["low.0.weight"][0, 0] == 1e6
-    assert_close(decoded.splats["means"], one.splats["means"])
 
 
 def test_splats_that_are_not_finite_are_left_out_and_huge_ones_written(tmp_path):
@@ -114,6 +118,14 @@ def test_splats_that_are_not_finite_are_left_out_and_huge_ones_written(tmp_path)
     one.splats["opacities"][:] = math.nan
     with pytest.raises(InputError, match="None of the 60"):
         through_a_file(one, tmp_path)
+
+
+def test_large_weights_and_a_lone_splat(tmp_path):
+    one = field(1)
+    one.head.low[0].weight[0, 0] = 1e6  # beyond float16
+    decoded = through_a_file(one, tmp_path)
+    assert decoded.weights["low.0.weight"][0, 0] == 1e6
+    assert_close(decoded.splats["means"], one.splats["means"])
 
 
 def test_a_file_alone_is_in_its_own_unit_of_length(tmp_path):
@@ -135,6 +147,8 @@ def test_a_file_alone_is_in_its_own_unit_of_length(tmp_path):
 
 
 # The command.
+
+
 @pytest.fixture(scope="module")
 def exported(tiny_scene, tmp_path_factory):
     """config.yml of an 8-step training with a loud field, the compact file, and the report."""

@@ -3,6 +3,7 @@
 
 import hashlib
 import shutil
+from functools import cache
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from compact_fields import in_node, write_container
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nrfgs_ns.compact.entropy import decode_table, encode_table
+from nrfgs_ns.compact.entropy import BadStream, decode_table, encode_table
 from nrfgs_ns.compact.format import Table
 
 
@@ -56,7 +57,7 @@ def test_any_table_comes_back(columns, rows, largest, signed, seed):
     assert (decode_table(*encode_table(table, signed), columns, rows) == table).all()
 
 
-def test_it_takes_what_entropy_says_and_less_with_neighbours():
+def test_it_takes_what_entropy_says():
     """Independent numbers cannot take less than their entropy; this takes 1 % more, and a model."""
     random = np.random.default_rng(3)
     table = np.rint(random.laplace(size=(4, 50_000)) * 3).astype(np.int64)
@@ -65,9 +66,41 @@ def test_it_takes_what_entropy_says_and_less_with_neighbours():
     entropy = -(counts * np.log2(counts / counts.sum())).sum() / 8
     assert entropy * 0.999 < len(data) < entropy * 1.01
     assert len(model) < 2000
+
+
+def test_neighbours_are_worth_something():
     table = laplacian(3, 30_000)
     shuffled = table[:, np.random.default_rng(0).permutation(30_000)]
     assert len(encode_table(table)[1]) < 0.8 * len(encode_table(shuffled)[1])
+
+
+@cache
+def small_stream():
+    return encode_table(laplacian(2, 200))
+
+
+@settings(max_examples=200)
+@given(st.data())
+def test_a_changed_byte_is_refused_or_gives_numbers(data):
+    """Without a checksum in front of it: whatever it is given, it ends, with numbers or with BadStream."""
+    model, stream = small_stream()
+    if data.draw(st.booleans()):
+        stream = bytearray(stream)
+        stream[data.draw(st.integers(0, len(stream) - 1))] ^= data.draw(st.integers(1, 255))
+    else:
+        model = model.copy()
+        model[data.draw(st.integers(0, len(model) - 1))] = data.draw(st.integers(-(2**31), 2**31 - 1))
+    try:
+        assert decode_table(model, bytes(stream), 2, 200).shape == (2, 200)
+    except BadStream:
+        pass
+
+
+@pytest.mark.parametrize("columns, rows", [(2, 199), (2, 201), (1, 200), (3, 200), (2, 10_000)])
+def test_another_shape_is_refused(columns, rows):
+    model, data = encode_table(laplacian(2, 200))
+    with pytest.raises(BadStream):
+        decode_table(model, data, columns, rows)
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="no node: the page's reader is tried by pytest -m browser")
