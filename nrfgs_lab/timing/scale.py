@@ -53,6 +53,8 @@ HOSTED = {
     "splatfacto": {"stop-split-at": 0, "sh-degree-interval": 1},
 }
 """Methods that train in nerfstudio's loop -> options of their models after growth, with all harmonics."""
+HEAD = {"densification": "splatfacto,stop_split_at=0"}
+"""The same of other methods of this project."""
 BARE = {"gsplat": "gsplat", "faster-gs": "FasterGSCudaBackend.torch_bindings"}
 """Renderers without a host -> modules that they need."""
 PARSER = "nrfgs-data --orientation-method none --center-method none --auto-scale-poses False --downscale-factor 1"
@@ -168,7 +170,7 @@ def write_scene(capture: Capture, folder: Path) -> None:
 def trainer_of(method: str, scene: Path, device: str, watch: Stopwatch, splats: dict[str, Tensor]) -> Any:
     """A trainer of nerfstudio's before its first step, with these splats."""
     method, _, variant = method.partition(":")
-    own = {"num-downscales": 0, "random-init": True, "num-random": 100, **HOSTED[method]}
+    own = {"num-downscales": 0, "random-init": True, "num-random": 100, **HOSTED.get(method, HEAD)}
     own |= {"warmup-steps": 0, "photographs": "off"} if method != "splatfacto" else {}
     options = {"--machine.device-type": device, "--max-num-iterations": watch.steps, "--output-dir": scene / "out"}
     options |= {f"--pipeline.model.{name}": value for name, value in own.items()}
