@@ -16,8 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def test_every_contract_is_kept(capsys, monkeypatch):
     monkeypatch.setattr("logging.config.dictConfig", lambda _: None)  # it would silence all loggers, for later tests
-    code = lint_imports(config_filename=str(ROOT / "pyproject.toml"), no_cache=True)
-    assert code == 0, capsys.readouterr().out
+    assert lint_imports(config_filename=str(ROOT / "pyproject.toml"), no_cache=True) == 0, capsys.readouterr().out
 
 
 @pytest.mark.parametrize("place", host.PRIVATE)

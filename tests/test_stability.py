@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The catalogue of extremes: its checks hold, and its tests exist. Hard trainings must end with finite numbers.
-docs/troubleshooting.md."""
+"""The catalogue of extremes holds, and its tests exist; hard trainings end finite (docs/troubleshooting.md)."""
 
 import ast
 import json
@@ -76,10 +75,7 @@ def test_hard_trainings_end_finite(name, tmp_path):
     edit, options, words = HARD[name]
     data = write_scene(SceneConfig(views=16, width=48, height=36, points=600, samples=2), tmp_path / "scene")
     edit(data)
-    usual = {
-        "--pipeline.model.num-downscales": 0,
-        "--pipeline.model.densification": "splatfacto,warmup_length=100",
-    }
+    usual = {"--pipeline.model.num-downscales": 0, "--pipeline.model.densification": "splatfacto,warmup_length=100"}
     config = trained([*command_line("nrfgs", data, tmp_path / "outputs", 200, usual, options), *words])
     results = evaluate(config, tmp_path / "eval.json")
     assert all(results[name] is not None for name in ("psnr", "ssim", "l1"))  # what is NaN is None there

@@ -63,8 +63,7 @@ def declared(about: Message, *extras: str) -> dict[str, Requirement]:
 def test_every_file_of_the_packages_is_in_it_and_entry_points_name_some(wheel):
     files = itertools.chain.from_iterable((ROOT / package).rglob("*") for package in PACKAGES)
     needed = {path.relative_to(ROOT).as_posix() for path in files if path.is_file() and path.suffix != ".pyc"}
-    inside = {name for name in wheel.namelist() if ".dist-info/" not in name}
-    assert inside == needed
+    assert {name for name in wheel.namelist() if ".dist-info/" not in name} == needed
     assert any(name.endswith("/LICENSE") for name in wheel.namelist())
     text = wheel.read(next(name for name in wheel.namelist() if name.endswith("/entry_points.txt"))).decode()
     targets = [line.split(" = ")[1] for line in text.splitlines() if " = " in line]
@@ -111,7 +110,5 @@ def test_the_lock_has_versions_that_are_asked_for(about):
 
 
 def test_citation_and_changelog_are_of_this_version():
-    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
-    assert citation["version"] == __version__
-    newest = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
-    assert newest[1] == __version__
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))["version"] == __version__
+    assert re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)[1] == __version__

@@ -38,9 +38,9 @@ camera = partial(entry, "cameras", 0, "id model w h p")
 image = partial(entry, "images", 3, "id q t camera name")
 
 
-def file(name: str, which: str, change, **options) -> Case:
+def file(name: str, which: str | Path, change, text: bool = False, **options) -> Case:
     def build(folder: Path):
-        scene = Model().write(folder / "scene")
+        scene = Model().write(folder / "scene", text)
         change(scene / which)
         return partial(load, scene, **options)
 
@@ -83,8 +83,8 @@ CASES = [
     model("no images", lambda one: one.images.clear()),
     model("no cameras", lambda one: one.cameras.clear()),
     model("points NaN", lambda one: setattr(one, "points", [(i, (NAN,) * 3, color) for i, _, color in one.points])),
-    *(file(f"{which} missing", str(MODEL / f"{which}.bin"), Path.unlink) for which in FILES),
-    *(file(f"{which} cut at {x}", str(MODEL / f"{which}.bin"), cut(x)) for which in FILES for x in (0, 0.2, 0.98)),
+    *(file(f"{which} missing", MODEL / f"{which}.bin", Path.unlink) for which in FILES),
+    *(file(f"{which} cut at {x}", MODEL / f"{which}.bin", cut(x)) for which in FILES for x in (0, 0.2, 0.98)),
     file("image missing", "images/003.png", Path.unlink),
     file("image unreadable", "images/003.png", cut(0.1)),
     file("image of another size", "images/003.png", lambda path: Image.new("RGB", (9, 9)).save(path)),
@@ -100,12 +100,8 @@ def inputs() -> st.SearchStrategy[Case]:
     """One file of a model, damaged."""
 
     def case(which: str, text: bool, chosen) -> Case:
-        def build(folder: Path):
-            scene = Model().write(folder / "scene", text)
-            path = scene / MODEL / f"{which}.{'txt' if text else 'bin'}"
-            path.write_bytes(damage(path.read_bytes(), chosen))
-            return partial(load, scene)
-
-        return Case(f"{which} {'text' if text else 'binary'} {chosen}"[:200], build, hostile=False)
+        path, name = MODEL / f"{which}.{'txt' if text else 'bin'}", f"{which} {'text' if text else 'binary'} {chosen}"
+        damaged = file(name[:200], path, lambda path: path.write_bytes(damage(path.read_bytes(), chosen)), text)
+        return damaged._replace(hostile=False)
 
     return st.builds(case, st.sampled_from(FILES), st.booleans(), DAMAGES)

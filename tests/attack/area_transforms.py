@@ -30,19 +30,13 @@ def add_points(capture: Capture, change=lambda xyz: xyz, text: bool = False) -> 
     return capture.add_ply(change(xyz), rgb, text)
 
 
-def capture_in(folder: Path) -> Capture:
-    """A capture with masks and points."""
-    capture = Capture(folder / "capture", images=10)
-    capture.add_masks()
-    add_points(capture)
-    return capture
-
-
 def broken(name: str, change, then=lambda path: None, **options) -> Case:
-    """A capture that `change` has changed before its transforms.json was written, and `then` thereafter."""
+    """A capture with masks and points, changed before its transforms.json is written, and `then` after that."""
 
     def build(folder: Path):
-        capture = capture_in(folder)
+        capture = Capture(folder / "capture", images=10)
+        capture.add_masks()
+        add_points(capture)
         change(capture)
         then(capture.save())
         return partial(load, capture.folder, **options)

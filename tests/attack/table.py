@@ -13,9 +13,7 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-for folder in (HERE, HERE.parent / "helpers"):
-    if str(folder) not in sys.path:
-        sys.path.insert(0, str(folder))
+sys.path[:0] = [str(HERE), str(HERE.parent / "helpers")]
 
 from attempt import GOOD, Case, Outcome, attempts  # noqa: E402
 from hypothesis import HealthCheck, Phase, given, settings  # noqa: E402

@@ -3,7 +3,6 @@
 
 import hashlib
 import shutil
-from functools import cache
 
 import numpy as np
 import pytest
@@ -17,8 +16,7 @@ from nrfgs_ns.compact.format import Table
 
 def laplacian(columns: int, rows: int, scale: float = 5.0, seed: int = 0) -> np.ndarray:
     """Columns that follow their neighbours, and each other."""
-    random = np.random.default_rng(seed)
-    steps = random.laplace(size=(columns, rows)) * scale * (1 + np.sin(np.arange(rows) / 50))
+    steps = np.random.default_rng(seed).laplace(size=(columns, rows)) * scale * (1 + np.sin(np.arange(rows) / 50))
     return np.rint(steps + 0.8 * np.roll(steps, 1, axis=0) + np.cumsum(steps, axis=1) * 0.2).astype(np.int64)
 
 
@@ -59,8 +57,7 @@ def test_any_table_comes_back(columns, rows, largest, signed, seed):
 
 def test_it_takes_what_entropy_says():
     """Independent numbers cannot take less than their entropy; this takes 1 % more, and a model."""
-    random = np.random.default_rng(3)
-    table = np.rint(random.laplace(size=(4, 50_000)) * 3).astype(np.int64)
+    table = np.rint(np.random.default_rng(3).laplace(size=(4, 50_000)) * 3).astype(np.int64)
     model, data = encode_table(table)
     _, counts = np.unique(table, return_counts=True)
     entropy = -(counts * np.log2(counts / counts.sum())).sum() / 8
@@ -74,16 +71,14 @@ def test_neighbours_are_worth_something():
     assert len(encode_table(table)[1]) < 0.8 * len(encode_table(shuffled)[1])
 
 
-@cache
-def small_stream():
-    return encode_table(laplacian(2, 200))
+SMALL = encode_table(laplacian(2, 200))
 
 
 @settings(max_examples=200)
 @given(st.data())
 def test_a_changed_byte_is_refused_or_gives_numbers(data):
     """Without a checksum in front of it: whatever it is given, it ends, with numbers or with BadStream."""
-    model, stream = small_stream()
+    model, stream = SMALL
     if data.draw(st.booleans()):
         stream = bytearray(stream)
         stream[data.draw(st.integers(0, len(stream) - 1))] ^= data.draw(st.integers(1, 255))
@@ -98,9 +93,8 @@ def test_a_changed_byte_is_refused_or_gives_numbers(data):
 
 @pytest.mark.parametrize("columns, rows", [(2, 199), (2, 201), (1, 200), (3, 200), (2, 10_000)])
 def test_another_shape_is_refused(columns, rows):
-    model, data = encode_table(laplacian(2, 200))
     with pytest.raises(BadStream):
-        decode_table(model, data, columns, rows)
+        decode_table(*SMALL, columns, rows)
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="no node: the page's reader is tried by pytest -m browser")

@@ -49,10 +49,9 @@ def test_what_goes_in_comes_out(written):
 def test_layout_is_as_documented(written):
     magic, version, length, total = struct.unpack("<8sIIQ", written[:24])
     assert magic == b"\x89NRF\r\n\x1a\n" and version == 3 and total == len(written)
-    header = json.loads(written[24 : 24 + length])
     assert struct.unpack("<I", written[24 + length : 28 + length]) == (zlib.crc32(written[: 24 + length]),)
     first = 28 + length
-    for entry in header["streams"]:
+    for entry in json.loads(written[24 : 24 + length])["streams"]:
         assert entry["coding"] == ("rans" if entry["name"] in TABLES else "xz")
         assert zlib.crc32(written[first : first + entry["bytes"]]) == entry["crc32"]
         start = first + (8 if entry["coding"] == "rans" else 0)

@@ -20,21 +20,10 @@ def pose(capture, row, column, value):
     capture.meta["frames"][2]["transform_matrix"][row][column] = value
 
 
-def everywhere(value):
-    def change(capture):
-        for frame in capture.meta["frames"]:
-            for row in range(3):
-                frame["transform_matrix"][row][3] = value
-
-    return change
-
-
-def with_masks(change):
-    def both(capture):
-        capture.add_masks()
-        change(capture)
-
-    return both
+def to_one_place(capture):
+    for frame in capture.meta["frames"]:
+        for row in range(3):
+            frame["transform_matrix"][row][3] = 2.5
 
 
 BROKEN = {  # what is done to the data set -> what the message must say
@@ -44,7 +33,7 @@ BROKEN = {  # what is done to the data set -> what the message must say
     "NaN in pose": (lambda c: pose(c, 0, 3, float("nan")), "transform_matrix 007.png finite Give"),
     "last row": (lambda c: pose(c, 3, 0, 0.1), "transform_matrix 007.png last row"),
     "sheared pose": (lambda c: pose(c, 0, 0, 2.0), "transform_matrix 007.png rigid shear"),
-    "one place": (everywhere(2.5), "all 10 cameras same place --auto-scale-poses"),
+    "one place": (to_one_place, "all 10 cameras same place --auto-scale-poses"),
     "no focal length": (lambda c: c.meta.pop("fl_x"), "fl_x missing 000.png camera_angle_x"),
     "twice in disguise": (
         lambda c: c.meta["frames"].append({**c.meta["frames"][0], "file_path": "./images/009.png"}),
@@ -59,22 +48,20 @@ BROKEN = {  # what is done to the data set -> what the message must say
         lambda c: c.meta["frames"][3].update(exif={"iso": float("inf")}),
         "transforms.json exif 006.png numbers above 0 remove",
     ),
-    "one mask lacking": (
-        with_masks(lambda c: c.meta["frames"][4].pop("mask_path")),
-        "mask_path images/005.png all-white for none",
-    ),
+    "one mask lacking": (lambda c: c.meta["frames"][4].pop("mask_path"), "mask_path images/005.png all-white for none"),
     "image missing": (lambda c: (c.folder / LAST).unlink(), "1 of 10 images missing 000.png Restore"),
     "image of another size": (
         lambda c: Image.new("RGB", (9, 12)).save(c.folder / "images/001.png"),
         "001.png 9 x 12 12 x 9 Use the images",
     ),
     "intrinsics of another size": (lambda c: c.meta.update(w=24, h=18), "8 images 12 x 9 24 x 18 scale w"),
-    "mask missing": (with_masks(lambda c: (c.folder / "masks/001.png").unlink()), "mask_path missing masks/001.png"),
+    "mask missing": (lambda c: (c.folder / "masks/001.png").unlink(), "mask_path missing masks/001.png"),
 }
 
 
 @pytest.mark.parametrize("change, words", BROKEN.values(), ids=BROKEN.keys())
 def test_refused(capture, change, words):
+    capture.add_masks()
     change(capture)
     with pytest.raises(InputError) as error:
         capture.parse()
@@ -91,16 +78,14 @@ def test_data_that_is_not_there(tmp_path, capture):
 
 
 def test_up_directions_that_cancel(capture):
-    frames = capture.meta["frames"] = capture.meta["frames"][:2]
-    poses = np.tile(np.eye(4), (2, 1, 1))
-    poses[1, :3, :3] = np.diag([-1.0, -1.0, 1.0])  # the second camera is upside down
-    poses[1, 0, 3] = 1.0
-    for frame, matrix in zip(frames, poses, strict=True):
-        frame["transform_matrix"] = matrix.tolist()
+    upside_down = [[-1.0, 0.0, 0.0, 1.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+    capture.meta["frames"] = capture.meta["frames"][:2]
+    for frame, matrix in zip(capture.meta["frames"], (np.eye(4).tolist(), upside_down), strict=True):
+        frame["transform_matrix"] = matrix
     with pytest.raises(InputError, match="--orientation-method none"):
         capture.parse()
     capture.parse(orientation_method="none")
-    everywhere(2.5)(capture)
+    to_one_place(capture)
     capture.parse(orientation_method="none", auto_scale_poses=False)  # one place is fine without it
 
 

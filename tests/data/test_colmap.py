@@ -99,8 +99,7 @@ def test_cameras_of_several_models(tmp_path):
 
 
 def test_names_with_spaces_and_images_without_features(tmp_path):
-    one = Model()
-    scene = one.write(tmp_path / "scene", text=True)
+    scene = Model().write(tmp_path / "scene", text=True)
     (scene / "images/003.png").rename(scene / "images/a b.png")
     file = scene / MODEL / "images.txt"
     lines = file.read_text().replace("003.png", "a b.png").splitlines()

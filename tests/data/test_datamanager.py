@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-import io
 import threading
 
 import numpy as np
@@ -10,15 +9,13 @@ from PIL import Image
 from small_capture import Capture
 
 from nrfgs_ns.data.datamanager import NrfgsDatamanager, NrfgsDatamanagerConfig, NrfgsInputDataset
-from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.data.pictures import in_parallel
 from nrfgs_ns.errors import InputError
 
 
 def manager(capture, parser_options=None, **options) -> NrfgsDatamanager:
-    capture.save()
     parser_options = {"eval_mode": "interval", **(parser_options or {})}  # tests on images 0 and 8
-    dataparser = NrfgsDataParserConfig(data=capture.folder, load_3D_points=False, **parser_options)
+    dataparser = capture.parser(load_3D_points=False, **parser_options).config
     return NrfgsDatamanagerConfig(dataparser=dataparser, **options).setup(device="cpu")
 
 
@@ -61,13 +58,10 @@ def test_other_images_are_converted_to_colour(capture, mode, channels, tolerance
     assert np.abs(data[..., :3].numpy().astype(int) - pixels).max() <= tolerance
 
 
-def test_images_are_made_smaller_to_the_size_of_their_cameras(tmp_path):
+def test_images_are_made_smaller_to_the_size_of_their_cameras(tmp_path, monkeypatch):
     """int(50 * 0.58) is 28, of which nerfstudio's cameras, in float32, make 29."""
-
-    class Wide(Capture):
-        width = 50
-
-    capture = Wide(tmp_path / "wide", images=10)
+    monkeypatch.setattr(Capture, "width", 50)
+    capture = Capture(tmp_path / "wide", images=10)
     capture.meta |= {"fl_x": 40.0, "fl_y": 40.0, "cx": 25.0}
     capture.add_masks()
     data = manager(capture, camera_res_scale_factor=0.58)
@@ -139,27 +133,20 @@ def next_cameras(data, count: int) -> list[int]:
     return [data.next_train(0)[0].metadata["cam_idx"] for _ in range(count)]
 
 
-def through_a_checkpoint(state: dict) -> dict:
-    file = io.BytesIO()
-    torch.save(state, file)
-    file.seek(0)
-    return torch.load(file, weights_only=True)
-
-
 @pytest.mark.parametrize("strategy", ["random", "fps"])
 @pytest.mark.parametrize("steps", [7, 8, 20])  # 8 cameras: before, at and after the end of a round
-def test_order_continues_after_a_restore(capture, strategy, steps):
+def test_order_continues_after_a_restore(capture, tmp_path, strategy, steps):
     # Rounds of 3 for fps, so that cameras miss whole rounds, which it remembers; random goes round all 8.
     options = {"train_cameras_sampling_strategy": strategy, "fps_reset_every": 3}
     first = manager(capture, **options)
     next_cameras(first, steps)
-    state = through_a_checkpoint(first.sampling_state())
+    torch.save(first.sampling_state(), tmp_path / "state.pt")
     expected = next_cameras(first, 30)
 
     second = manager(capture, **options)
     next_cameras(second, 5)
     np.random.rand(3)
-    second.load_sampling_state(state)
+    second.load_sampling_state(torch.load(tmp_path / "state.pt", weights_only=True))
     assert next_cameras(second, 30) == expected
     assert len(set(expected)) > 3
 
@@ -187,8 +174,7 @@ def test_images_in_files_are_those_in_memory(capture, tmp_path, monkeypatch, pri
         torch.testing.assert_close(found, expected, rtol=0, atol=0)
         for step in range(20):
             camera, batch = in_files.next_train(step)
-            kept = in_memory.cached_train[camera.metadata["cam_idx"]]
-            torch.testing.assert_close(batch["image"], kept["image"])
+            torch.testing.assert_close(batch["image"], in_memory.cached_train[camera.metadata["cam_idx"]]["image"])
         in_files.cached_train[0]["image"].zero_()  # in memory, not in the file
     assert len(list((tmp_path / "cache").rglob("*.npy"))) == 10 * 3, "an image, a mask and a lens, each made once"
 

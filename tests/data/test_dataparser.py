@@ -40,8 +40,7 @@ def assert_points_stay_in_front_of_cameras(capture, outputs, xyz):
 
 def test_every_eighth_image_by_sorted_name_is_test_but_neither_end(capture):
     capture.add_masks()
-    parser = capture.parser()
-    parts = {split: parser.get_dataparser_outputs(split) for split in ("train", "val", "test")}
+    parts = {split: capture.parse(split) for split in ("train", "val", "test")}
     assert names(parts["train"]) == [0, 1, 2, 3, 5, 6, 7, 8, 9]
     assert names(parts["val"]) == names(parts["test"]) == [4]
     whole = capture.parse(eval_mode="all")
@@ -64,8 +63,7 @@ def test_interior_test_images(count, test):
 def test_cameras_are_those_of_nerfstudio(capture, split, distortion):
     capture.meta |= distortion
     ours = capture.parse(split, eval_mode="interval")
-    config = NerfstudioDataParserConfig(data=capture.folder, eval_mode="interval")
-    theirs = config.setup().get_dataparser_outputs(split)
+    theirs = NerfstudioDataParserConfig(data=capture.folder, eval_mode="interval").setup().get_dataparser_outputs(split)
     assert ours.image_filenames == theirs.image_filenames
     for name in ("camera_to_worlds", "fx", "fy", "cx", "cy", "width", "height", "distortion_params"):
         assert torch.equal(getattr(ours.cameras, name), getattr(theirs.cameras, name)), name
@@ -78,10 +76,8 @@ def test_cameras_are_those_of_nerfstudio(capture, split, distortion):
 def test_val_and_test_stand_in_for_each_other(capture, printed, kept, other):
     path = [frame["file_path"] for frame in capture.meta["frames"]]
     capture.meta |= {"train_filenames": path[3:], f"{kept}_filenames": path[:3], **other}
-    parser = capture.parser()
-    assert names(parser.get_dataparser_outputs("train")) == list(range(7))
-    assert names(parser.get_dataparser_outputs("val")) == [7, 8, 9]
-    assert names(parser.get_dataparser_outputs("test")) == [7, 8, 9]
+    assert names(capture.parse("train")) == list(range(7))
+    assert names(capture.parse("val")) == names(capture.parse("test")) == [7, 8, 9]
     assert "evaluated instead" not in printed()
 
 
@@ -186,11 +182,8 @@ def test_rendering_from_a_checkpoint_needs_no_files(capture):
 def test_nerfstudio_finds_the_plugin_where_it_is_imported_first():
     """nerfstudio loads plugins while it imports itself: a circle of imports would show in one of the two orders."""
     code = "import nrfgs_ns.data.dataparser; from nerfstudio.configs.dataparser_configs import all_dataparsers as a;"
-    environment = {
-        **os.environ,
-        "NERFSTUDIO_DATAPARSER_CONFIGS": "nrfgs-data=nrfgs_ns.data.dataparser:nrfgs_dataparser",
-        "PYTHONPATH": os.pathsep.join(sys.path),
-    }
+    parsers = {"NERFSTUDIO_DATAPARSER_CONFIGS": "nrfgs-data=nrfgs_ns.data.dataparser:nrfgs_dataparser"}
+    environment = {**os.environ, **parsers, "PYTHONPATH": os.pathsep.join(sys.path)}
     subprocess.run([sys.executable, "-c", code + "a['nrfgs-data']"], env=environment, check=True, timeout=300)
 
 

@@ -9,7 +9,6 @@ from small_capture import Capture, listing
 from small_colmap import Model
 
 from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
-from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.data.pictures import read_exif
 from nrfgs_ns.errors import InputError
 from nrfgs_prepare.photos import exif_of_copy
@@ -22,8 +21,7 @@ def test_images_are_resized_where_there_is_no_folder_of_them(tmp_path, layout):
     else:
         capture = Capture(tmp_path / "scene", images=10)
         capture.add_masks()
-        capture.save()
-        config = NrfgsDataParserConfig(data=capture.folder, downscale_factor=2, eval_mode="interval")
+        config = capture.parser(downscale_factor=2, eval_mode="interval").config
     before = listing(tmp_path / "scene")
     manager = NrfgsDatamanagerConfig(dataparser=config).setup(device="cpu")
     assert manager.load_all_images() == (8, 2)
@@ -60,8 +58,7 @@ def test_large_photographs_of_colmap_need_no_answer(tmp_path, monkeypatch):
     scene = one.write(tmp_path / "scene")
     for path in (scene / "images").iterdir():
         Image.new("RGB", (1700, 8)).save(path)
-    config = ColmapDataParserConfig(data=scene)
-    manager = NrfgsDatamanagerConfig(dataparser=config).setup(device="cpu")
+    manager = NrfgsDatamanagerConfig(dataparser=ColmapDataParserConfig(data=scene)).setup(device="cpu")
     assert manager.train_dataset[0]["image"].shape == (4, 850, 3)
 
 
@@ -72,16 +69,9 @@ def photographed(path, **details):
     exif = Image.Exif()
     exif[ExifTags.Base.Make], exif[ExifTags.Base.Model], exif[ExifTags.Base.Orientation] = "Maker", "Phone\0", 6
     exif[ExifTags.Base.ImageDescription] = "a thousand words"
-    exif.get_ifd(ExifTags.IFD.Exif).update(
-        {
-            ExifTags.Base.ExposureTime: 1 / 250,
-            ExifTags.Base.FNumber: 2.4,
-            ExifTags.Base.ISOSpeedRatings: 50,
-            ExifTags.Base.FocalLength: 4.3,
-            ExifTags.Base.ExifImageWidth: 4000,
-        }
-        | {getattr(ExifTags.Base, name): value for name, value in details.items()}
-    )
+    usual = {"ExposureTime": 1 / 250, "FNumber": 2.4, "ISOSpeedRatings": 50, "FocalLength": 4.3, "ExifImageWidth": 4000}
+    tags = {getattr(ExifTags.Base, name): value for name, value in (usual | details).items()}
+    exif.get_ifd(ExifTags.IFD.Exif).update(tags)
     exif.get_ifd(ExifTags.IFD.GPSInfo).update({1: "N", 2: (55.0, 41.0, 53.4), 3: "E", 4: (13.0, 11.0, 43.4)})
     Image.new("RGB", (8, 6)).save(path, exif=exif)
     return path

@@ -57,12 +57,10 @@ def test_exposure_does_not_matter_and_nothing_is_found_where_nothing_can_be_told
     even, _ = sweep.dense_points(*plane(AROUND), share=1.0)
     uneven, _ = sweep.dense_points(*plane(AROUND, brightness=(1.0, 0.7, 0.9)), share=1.0)
     assert len(uneven) == pytest.approx(len(even), rel=0.05)
-    same_place = plane([(0.0, 0.0)] * 4)
     plain = plane(AROUND, pattern=lambda x, y: 0.5 + 0 * torch.stack([x, y, x], dim=-1))
     masked, points = plane(AROUND)
     masked = masked._replace(valid=torch.zeros_like(masked.valid))
-    two = plane(AROUND[:2])
-    for views, own in (same_place, plain, (masked, points), two):
+    for views, own in (plane([(0.0, 0.0)] * 4), plain, (masked, points), plane(AROUND[:2])):
         xyz, rgb = sweep.dense_points(views, own, share=1.0)
         assert xyz.shape == rgb.shape == (0, 3)
 
@@ -85,9 +83,7 @@ def test_the_share_falls_smoothly_to_nothing():
     shares = [sweep.share_kept(views) / sweep.KEPT for views in range(3, 400)]
     assert shares[0] == pytest.approx(1.0, rel=0.01) and shares[-1] == 0
     assert all(0 <= a - b < 0.02 + 0.05 * (b == 0) for a, b in zip(shares, shares[1:], strict=False))
-    few, _ = sweep.dense_points(*plane(AROUND), share=0.25)
-    again, _ = sweep.dense_points(*plane(AROUND), share=0.25)
-    every, _ = sweep.dense_points(*plane(AROUND), share=1.0)
+    few, again, every = (sweep.dense_points(*plane(AROUND), share=share)[0] for share in (0.25, 0.25, 1.0))
     assert len(few) == pytest.approx(len(every) / 4, rel=0.2) and torch.equal(few, again)
 
 
@@ -107,11 +103,8 @@ def test_a_training_starts_with_them_if_asked_to():
     datamanager = SimpleNamespace(train_dataset=dataset, cached_train=images)
     (note,) = start_with_dense_points(model, datamanager)
     (xyz, rgb), count = started[0], len(own)
-    assert torch.equal(xyz[:count], own) and (rgb[:count] == 9).all()
-    assert (
-        len(xyz) > count + 200
-        and note == f"start: {count} points of the capture, {len(xyz) - count} from the photographs"
-    )
+    assert torch.equal(xyz[:count], own) and (rgb[:count] == 9).all() and len(xyz) > count + 200
+    assert note == f"start: {count} points of the capture, {len(xyz) - count} from the photographs"
     assert ((xyz[:, 2] - DISTANCE - xyz[:, 0] / 4).abs().median() / DISTANCE) < 0.003 and 20 < rgb[count:].mean() < 235
     for config in ({"dense_start": "off", "random_init": False}, {"dense_start": "auto", "random_init": True}):
         model.config = SimpleNamespace(**config)

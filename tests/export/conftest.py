@@ -2,7 +2,8 @@
 import functools
 
 import pytest
-from short_trainings import command_line, trained
+from short_trainings import PLAIN, command_line, trained
+from web_pages import Page, page_with, wall_scene
 
 from nrfgs_lab.pages import pictures as browsers
 from nrfgs_ns.export.command import Web
@@ -24,29 +25,25 @@ def demo(tiny_scene, tmp_path_factory):
     """config.yml of a short training on the procedural scene, and its page."""
     folder = tmp_path_factory.mktemp("demo")
     options = {
-        "--pipeline.model.num-downscales": 0,
-        "--pipeline.model.few-views": "off",
-        "--pipeline.model.shrinkage": 0,
         "--pipeline.model.densification": "splatfacto,warmup_length=20,refine_every=20",
         "--pipeline.model.rasterize-mode": "antialiased",
         "--optimizers.field.optimizer.lr": 0.05,  # something to show after a few steps
     }
-    config = trained(command_line("nrfgs", tiny_scene, folder, 80, options))
+    config = trained(command_line("nrfgs", tiny_scene, folder, 80, PLAIN, options))
     Web(config, output=folder / "page.html").main()
     return config, folder / "page.html"
 
 
 @pytest.fixture
 def opened(browser):
-    """Open an address in a window of its own, which closes at the end, without an error in its console; `begun`: wait
-    for the page's scene."""
-    from web_pages import Page
-
+    """Open an address in a window of its own, which ends without an error in its console; `begun`: wait for it."""
     pages = []
 
     def page(address, *window, begun=True, **context) -> Page:
         pages.append(Page(browser, address, *window, **context))
-        return pages[-1].begun() if begun else pages[-1]
+        if begun:
+            pages[-1].page.evaluate("nrfgs.ready")
+        return pages[-1]
 
     yield page
     for page in pages:
@@ -63,7 +60,6 @@ def on_demo(opened, demo):
 @pytest.fixture
 def wall(opened, tmp_path):
     """Open a page of a wall; `more`: values for its scripts; `tail`: of its address."""
-    from web_pages import page_with, wall_scene
 
     def page(size=(320, 240), before="", tail="", **more):
         scene, photographs = wall_scene(tmp_path)

@@ -2,7 +2,6 @@
 """The PLY file: its layout, what the fit keeps of the head, and that nerfstudio's exporter writes the same."""
 
 import base64
-import functools
 import json
 import math
 import re
@@ -26,7 +25,7 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.export import ply
 from nrfgs_ns.export.command import Compact, Export, Ply, Web
 from nrfgs_ns.export.frames import Y_DOWN
-from nrfgs_ns.export.options import WebOptions
+from nrfgs_ns.export.options import PlyOptions, WebOptions
 from nrfgs_ns.export.ply import read_splats, render_splats, write_splats
 from nrfgs_ns.image.metrics import psnr
 from nrfgs_ns.model import harmonics_fit, harmonics_tune
@@ -57,12 +56,9 @@ def short_fine_tune(monkeypatch):
 
 @pytest.fixture(scope="module")
 def trained(tiny_scene, tmp_path_factory):
-    @functools.cache
-    def config_of(method: str) -> Path:
-        out = tmp_path_factory.mktemp(method)
-        return short_trainings.trained(command_line(method, tiny_scene, out, 8, METHODS[method]))
-
-    return config_of
+    """Method -> config.yml."""
+    lines = {name: command_line(name, tiny_scene, tmp_path_factory.mktemp(name), 8, METHODS[name]) for name in METHODS}
+    return {name: short_trainings.trained(line) for name, line in lines.items()}
 
 
 def model_on(scene: Path, out: Path, method: str = "nrfgs", *options: str):
@@ -74,12 +70,15 @@ def model_on(scene: Path, out: Path, method: str = "nrfgs", *options: str):
     return pipeline.model, pipeline.datamanager.train_dataset.cameras
 
 
+def one_by_one(cameras):
+    return [cameras[index : index + 1] for index in range(len(cameras))]
+
+
 # The file.
 def test_layout_is_that_of_3dgs(tmp_path):
     splats = plain_splats(7)
     assert write_splats(splats, tmp_path / "deep" / "splats.ply") == 7
-    data = (tmp_path / "deep" / "splats.ply").read_bytes()
-    header, _, body = data.partition(b"end_header\n")
+    header, _, body = (tmp_path / "deep" / "splats.ply").read_bytes().partition(b"end_header\n")
     lines = header.decode("ascii").splitlines()
     assert lines[:2] == ["ply", "format binary_little_endian 1.0"] and "element vertex 7" in lines
     assert re.findall(r"property (\w+) (\w+)", header.decode()) == [("float", name) for name in LAYOUT]
@@ -115,15 +114,9 @@ def test_splats_that_cannot_be_drawn_are_left_out_also_of_a_turned_scene(tmp_pat
 
 
 # The fit.
-class HarmonicsByAnotherName(SphericalHarmonics):
-    """A head that is harmonics without saying so."""
-
-    is_harmonics = False
-
-
-def test_a_head_that_is_harmonics_is_fitted_exactly(tiny_scene, tmp_path):
+def test_a_head_that_is_harmonics_is_fitted_exactly(tiny_scene, tmp_path, monkeypatch):
     model, cameras = model_on(tiny_scene, tmp_path, "nrfgs-sh")
-    model.head = HarmonicsByAnotherName(model.config.appearance)
+    monkeypatch.setattr(SphericalHarmonics, "is_harmonics", False)  # it does not say so
     # Below 0.5 in sum, so that no colour is clamped at zero: 15 harmonics of at most 1.2, coefficients around 0.02.
     model.gauss_params["features_rest"].data.normal_(0.0, 0.02)
     model.gauss_params["features_dc"].data.clamp_(-0.3, 0.3)
@@ -131,8 +124,8 @@ def test_a_head_that_is_harmonics_is_fitted_exactly(tiny_scene, tmp_path):
     assert not fit.exact and fit.strength == STRENGTHS[0]
 
     errors, weights = torch.zeros(len(fit.splats.means)), torch.zeros(len(fit.splats.means))
-    for index in range(len(cameras)):
-        seen = observe(model, cameras[index : index + 1])
+    for camera in one_by_one(cameras):
+        seen = observe(model, camera)
         delta = torch.cat([fit.splats.features_dc - model.features_dc, fit.splats.features_rest.flatten(1)], dim=1)
         found = torch.einsum("mb,mbc->mc", seen.bases, delta[seen.rows].reshape(-1, 16, 3))
         errors.index_add_(0, seen.rows, seen.weights * (found - seen.residuals).square().sum(-1))
@@ -147,22 +140,20 @@ def test_a_head_that_is_harmonics_is_fitted_exactly(tiny_scene, tmp_path):
 
 def test_a_ridge_counts_in_views():
     """Seen in one view only, a splat moves 16 / (4 pi) / (16 / (4 pi) + ridge) of the way, whatever its size."""
-    direction = torch.nn.functional.normalize(torch.tensor([[0.3, -0.5, 0.8]]), dim=-1)
+    bases = sh_bases(3, torch.nn.functional.normalize(torch.tensor([[0.3, -0.5, 0.8]]), dim=-1))
     residual = torch.tensor([[0.1, -0.2, 0.05]])
     power = 16 / (4 * math.pi)
     for weight in (1e-3, 1e4):
         for views in (1, 3):
             moments = Moments(2, torch.device("cpu"))
             for _ in range(views):
-                bases = sh_bases(3, direction)
                 moments.add(Observations(torch.tensor([1]), torch.tensor([weight]), bases, residual, torch.ones(1)))
             delta = moments.solve(0.5)
             assert (delta[0] == 0).all(), "what was not seen keeps its base colour"
             reached = torch.einsum("mb,bc->mc", bases.double(), delta[1])
             assert_close(reached, residual.double() * views * power / (views * power + 0.5), rtol=1e-6, atol=0)
-            assert moments.squared_error(delta) == pytest.approx(
-                views * weight * float((reached - residual).square().sum()), rel=1e-5
-            )
+            left = views * weight * float((reached - residual).square().sum())
+            assert moments.squared_error(delta) == pytest.approx(left, rel=1e-5)
 
 
 def test_work_in_pieces_gives_the_same_fit(tiny_scene, tmp_path, monkeypatch):
@@ -193,8 +184,8 @@ def test_opacity_is_the_mean_over_views_also_over_those_in_which_a_splat_is_tran
     model.gauss_params["means"].data[7] = 1e3  # in no view
     found = fit_harmonics(model, cameras).splats.opacities[:, 0].sigmoid()
     total, views = torch.zeros(model.num_points), torch.zeros(model.num_points)
-    for index in range(len(cameras)):
-        view = model.project(cameras[index : index + 1])
+    for camera in one_by_one(cameras):
+        view = model.project(camera)
         total[view.visible] += model.field.seen_from(view).opacities
         views[view.visible] += 1
     pictured, stored = views > 0, model.gauss_params["opacities"].sigmoid()[:, 0]
@@ -205,12 +196,10 @@ def test_opacity_is_the_mean_over_views_also_over_those_in_which_a_splat_is_tran
 
 
 def squared_distance(model, splats: PlainSplats, cameras) -> float:
-    total = 0.0
-    for index in range(len(cameras)):
-        camera = cameras[index : index + 1]
-        wanted = model.get_outputs_for_camera(camera)["rgb"]
-        total += float((render_splats(splats, camera, model.background_color) - wanted).square().mean())
-    return total / len(cameras)
+    def off(camera) -> torch.Tensor:
+        return render_splats(splats, camera, model.background_color) - model.get_outputs_for_camera(camera)["rgb"]
+
+    return float(torch.stack([off(camera) for camera in one_by_one(cameras)]).square().mean())
 
 
 def test_splats_that_not_all_views_show_are_drawn_closer_after_the_fine_tune(tiny_scene, tmp_path):
@@ -229,9 +218,9 @@ def test_splats_that_not_all_views_show_are_drawn_closer_after_the_fine_tune(tin
         assert after < 0.7 * before
 
 
-def test_the_fine_tune_leaves_alone_what_is_right(tiny_scene, tmp_path):
+def test_the_fine_tune_leaves_alone_what_is_right(tiny_scene, tmp_path, monkeypatch):
     model, cameras = model_on(tiny_scene, tmp_path, "nrfgs-sh")
-    model.head = HarmonicsByAnotherName(model.config.appearance)
+    monkeypatch.setattr(SphericalHarmonics, "is_harmonics", False)  # it does not say so
     fitted = fit_harmonics(model, cameras).splats
     # Of 255 steps of a screen, a hundredth.
     assert squared_distance(model, fine_tune(model, fitted, cameras, 20), cameras) < (0.01 / 255) ** 2
@@ -240,13 +229,11 @@ def test_the_fine_tune_leaves_alone_what_is_right(tiny_scene, tmp_path):
 # The commands.
 @pytest.mark.parametrize("method", METHODS)
 def test_the_command_writes_the_splats_and_says_what_was_lost(method, trained, tmp_path):
-    config, ours, report = trained(method), tmp_path / "ours.ply", tmp_path / "deep" / "report.json"
-    words = ["ply", "--load-config", str(config), "--output", str(ours), "--report", str(report)]
-    tyro.cli(Export, args=words).main()
+    config, ours, report = trained[method], tmp_path / "ours.ply", tmp_path / "deep" / "report.json"
+    tyro.cli(Export, args=["ply", "--load-config", str(config), "--output", str(ours), "--report", str(report)]).main()
     splats = PlyData.read(ours)["vertex"].data
     assert list(splats.dtype.names) == LAYOUT
-    norms = sum(splats[f"rot_{i}"].astype(np.float64) ** 2 for i in range(4))
-    assert np.abs(norms - 1).max() < 1e-6
+    assert np.abs(sum(splats[f"rot_{i}"].astype(np.float64) ** 2 for i in range(4)) - 1).max() < 1e-6
 
     numbers = json.loads(report.read_text())
     assert numbers["written"] == len(splats) <= numbers["splats"] and numbers["bytes"] == ours.stat().st_size
@@ -259,20 +246,19 @@ def test_the_command_writes_the_splats_and_says_what_was_lost(method, trained, t
     assert numbers["exact"] == (method == "nrfgs-sh")
 
 
-def test_every_world_holds_the_same_scene(trained, tmp_path, capsys):
+def test_every_world_holds_the_same_scene(trained, tmp_path):
     """Turned, scaled and with harmonics that turn along, it looks the same from cameras that do."""
     reports, means = {}, {}
     for world in ("training", "viewers", "capture"):
         out, report = tmp_path / f"{world}.ply", tmp_path / f"{world}.json"
-        words = ["ply", "--load-config", str(trained("nrfgs")), "--output", str(out), "--report", str(report)]
+        words = ["ply", "--load-config", str(trained["nrfgs"]), "--output", str(out), "--report", str(report)]
         tyro.cli(Export, args=[*words, "--world", world]).main()
         reports[world], means[world] = json.loads(report.read_text()), read_splats(out).means
         # The same pictures but for float32's rounding, at 16 dB.
         assert reports[world]["psnr_file"] == pytest.approx(reports["training"]["psnr_file"], abs=1e-3)
     x, y, z = means["training"].unbind(-1)
     assert_close(means["viewers"], torch.stack([x, -z, y], dim=-1), rtol=0, atol=1e-6)  # z up becomes y down
-    pipeline = load_model(trained("nrfgs"), "inference")
-    outputs = pipeline.datamanager.train_dataparser_outputs
+    outputs = load_model(trained["nrfgs"], "inference").datamanager.train_dataparser_outputs
     transform = outputs.dataparser_transform.double()
     in_capture = (means["training"].double() / outputs.dataparser_scale - transform[:, 3]) @ transform[:, :3]
     assert_close(means["capture"], in_capture.float())
@@ -280,19 +266,18 @@ def test_every_world_holds_the_same_scene(trained, tmp_path, capsys):
 
 
 def test_an_antialiased_model_is_marked_as_such(trained, tmp_path, monkeypatch):
-    pipeline = load_model(trained("nrfgs"), "inference")
+    pipeline = load_model(trained["nrfgs"], "inference")
     monkeypatch.setattr(ply, "load_model", lambda *_: pipeline)
     for mode, comments in (("antialiased", ["SplatRenderMode: mip"]), ("classic", [])):
         pipeline.model.config.rasterize_mode = mode
-        Ply(trained("nrfgs"), output=tmp_path / "s.ply", measure=False).main()
+        Ply(trained["nrfgs"], output=tmp_path / "s.ply", measure=False).main()
         assert PlyData.read(str(tmp_path / "s.ply")).comments == comments
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_ns_export_writes_the_same_splats(method, trained, tmp_path, export_gaussian_splat):
-    config, ours = trained(method), tmp_path / "ours.ply"
-    words = ["ply", "--load-config", str(config), "--output", str(ours), "--no-measure", "--world", "training"]
-    tyro.cli(Export, args=words).main()
+    config, ours = trained[method], tmp_path / "ours.ply"
+    Ply(config, output=ours, measure=False, options=PlyOptions(world="training")).main()
     export_gaussian_splat(load_config=config, output_dir=tmp_path, output_filename="theirs.ply").main()
     a, b = (PlyData.read(tmp_path / f"{name}.ply")["vertex"].data for name in ("ours", "theirs"))
     assert a.dtype == b.dtype
@@ -306,21 +291,20 @@ def test_an_independent_reader_renders_the_models_picture(trained, tmp_path):
 
     from nrfgs_ns.model.renderer import pinhole
 
-    config = trained("nrfgs-sh")
-    words = ["ply", "--load-config", str(config), "--output", str(tmp_path / "s.ply"), "--no-measure"]
-    tyro.cli(Export, args=[*words, "--world", "training"]).main()
+    config = trained["nrfgs-sh"]
+    Ply(config, output=tmp_path / "s.ply", measure=False, options=PlyOptions(world="training")).main()
     vertices = PlyData.read(tmp_path / "s.ply")["vertex"]
     table = torch.from_numpy(np.stack([vertices[name] for name in LAYOUT], axis=-1))
     means, _, dc, rest, opacities, scales, quats = table.split((3, 3, 3, 45, 1, 3, 4), dim=1)
     coefficients = torch.cat([dc[:, None], rest.reshape(-1, 3, 15).transpose(1, 2)], dim=1)
-    model = load_model(config, "inference").model
     assert float(rest.abs().max()) > 1e-4, "the training must have reached the higher degrees"
-    camera = load_model(config, "test").datamanager.eval_dataset.cameras[:1]
+    pipeline = load_model(config, "test")
+    camera = pipeline.datamanager.eval_dataset.cameras[:1]
     view = pinhole(camera, camera.camera_to_worlds, 1)
     colors = (_spherical_harmonics(3, means - view.center, coefficients) + 0.5).clamp_min(0.0)
     shapes = means, quats, scales.exp(), opacities[:, 0].sigmoid(), colors
     render, alphas, _ = rasterization(*shapes, view.viewmat, view.K, view.width, view.height)
-    outputs = model.get_outputs_for_camera(camera)
+    outputs = pipeline.model.get_outputs_for_camera(camera)
     picture = (render[0] + (1 - alphas[0]) * outputs["background"]).clamp(0, 1)
     # Both in float32 through the same compositing; quaternions are normalised once more, in a few ulp.
     assert_close(picture, outputs["rgb"], rtol=0, atol=1e-4)
@@ -341,17 +325,16 @@ def test_trainings_and_viewers_see_the_stored_tables(mode, tiny_scene, tmp_path,
 
 def test_mistakes_are_told_in_a_sentence(trained, tmp_path):
     with pytest.raises(InputError, match="is a folder"):
-        Ply(trained("nrfgs"), output=tmp_path).main()
+        Ply(trained["nrfgs"], output=tmp_path).main()
     (tmp_path / "file").touch()
     for kind in (Ply, Compact, Web):  # before anything is loaded
         for name, report in (("file/s.html", None), ("s.html", tmp_path / "file" / "report.json")):
             with pytest.raises(InputError, match="cannot be written"):
-                kind(trained("nrfgs"), output=tmp_path / name, report=report).main()
+                kind(trained["nrfgs"], output=tmp_path / name, report=report).main()
     with pytest.raises(InputError, match="the 'sh' head.*nrfgs export ply"):
-        Web(trained("nrfgs-sh"), output=tmp_path / "page.html").main()
+        Web(trained["nrfgs-sh"], output=tmp_path / "page.html").main()
     lost = tmp_path / "config.yml"
-    text = trained("nrfgs").read_text()
-    lost.write_text(text.replace("timestamp: ", "timestamp: no-"))
+    lost.write_text(trained["nrfgs"].read_text().replace("timestamp: ", "timestamp: no-"))
     with pytest.raises(InputError, match="no checkpoints beside it"):
         Ply(lost, output=tmp_path / "s.ply").main()
 
@@ -359,17 +342,15 @@ def test_mistakes_are_told_in_a_sentence(trained, tmp_path):
 # The page.
 def test_a_page_holds_the_scene_and_the_photographs(trained, tmp_path):
     report = tmp_path / "report.json"
-    web = WebOptions(author="me")
-    Web(trained("nrfgs"), output=tmp_path / "a/tea.html", report=report, page=web).main()
+    Web(trained["nrfgs"], output=tmp_path / "a/tea.html", report=report, page=WebOptions(author="me")).main()
     numbers, text = json.loads(report.read_text()), (tmp_path / "a/tea.html").read_text(encoding="utf-8")
     assert "<h1>tea</h1><p>me</p>" in text
     (tmp_path / "held.nrf").write_bytes(base64.b64decode(re.search('id="packed"[^>]*>([^<]*)<', text).group(1)))
-    decoded = decode(tmp_path / "held.nrf")
-    assert len(decoded.splats["means"]) == numbers["written"] > 0
+    assert len(decode(tmp_path / "held.nrf").splats["means"]) == numbers["written"] > 0
     assert numbers["bytes"] == (tmp_path / "a/tea.html").stat().st_size > numbers["scene_bytes"]
     assert abs(numbers["loss_db"]) < 0.5 and len(numbers["per_image"]) == 2
 
-    pipeline = load_model(trained("nrfgs"), "test")
+    pipeline = load_model(trained["nrfgs"], "test")
     cameras = pipeline.datamanager.train_dataset.cameras
     about = json.loads(re.search('id="about"[^>]*>([^<]*)<', text).group(1))
     names = [path.name for path in pipeline.datamanager.train_dataset.image_filenames]
@@ -380,18 +361,18 @@ def test_a_page_holds_the_scene_and_the_photographs(trained, tmp_path):
         assert one["distance"] > 0
     # It begins where the model is best, of the views that were asked: of this few, all.
     scores = []
-    for i, batch in enumerate(pipeline.datamanager.cached_train):
-        picture = pipeline.model.get_outputs_for_camera(cameras[i : i + 1])["rgb"]
+    for camera, batch in zip(one_by_one(cameras), pipeline.datamanager.cached_train, strict=True):
+        picture = pipeline.model.get_outputs_for_camera(camera)["rgb"]
         scores.append(psnr(picture, pipeline.model.get_gt_img(batch["image"])[..., :3]))
     assert scores[about["start"]] == max(scores)
 
 
 def test_a_page_apart_from_its_scene(trained, tmp_path):
-    Web(trained("nrfgs"), output=tmp_path / "served", measure=False).main()
+    Web(trained["nrfgs"], output=tmp_path / "served", measure=False).main()
     assert {path.name for path in (tmp_path / "served").iterdir()} == {"index.html", "scene.nrf"}
     decode(tmp_path / "served/scene.nrf")
     (tmp_path / "taken").write_text("")
     (tmp_path / "taken.html").mkdir()
     for name, kind in (("taken", "file"), ("taken.html", "folder")):
         with pytest.raises(InputError, match=f"is a {kind}. Name a file that ends in .html"):
-            Web(trained("nrfgs"), output=tmp_path / name).main()
+            Web(trained["nrfgs"], output=tmp_path / name).main()

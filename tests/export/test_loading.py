@@ -25,22 +25,16 @@ from nrfgs_ns.training.trainer import end_earlier_logs
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
 
-@pytest.fixture
-def project(tiny_scene, tmp_path, monkeypatch):
-    """A folder with a data set and, trained on it by relative paths, a model of 3 steps in two checkpoints."""
-    (tmp_path / "project").mkdir()
+def test_a_project_is_read_from_another_folder_and_after_a_move(tiny_scene, tmp_path, monkeypatch):
+    """Trained by relative paths, in two checkpoints."""
     shutil.copytree(tiny_scene, tmp_path / "project" / "data")
     monkeypatch.chdir(tmp_path / "project")
     config = trained(command_line("nrfgs", "data", "outputs", 3, {"--steps-per-save": 1}))
     end_earlier_logs()  # written by a relative path, too
     monkeypatch.chdir(tmp_path)
-    return tmp_path / "project" / config
-
-
-def test_a_project_is_read_from_another_folder_and_after_a_move(project, tmp_path, monkeypatch):
-    assert load_training(project, "test").step == 2
+    assert load_training(tmp_path / "project" / config, "test").step == 2
     shutil.move(tmp_path / "project", tmp_path / "moved")
-    config = tmp_path / "moved" / project.relative_to(tmp_path / "project")
+    config = tmp_path / "moved" / config
     (models_of(config) / "notes.txt").write_text("mine")
     found = load_training(config, "test")
     assert found.step == 2 and found.checkpoint.parent == models_of(config)
@@ -62,12 +56,9 @@ def test_a_project_is_read_from_another_folder_and_after_a_move(project, tmp_pat
     assert found.step == 1 and torch.equal(found.pipeline.model.means, whole)
 
     shutil.rmtree(tmp_path / "moved" / "data")
-    with pytest.raises(
-        InputError, match=r"its data set is not at .*/project/data, nor at .*/moved/data\. Put it there"
-    ):
-        load_training(config, "test")
-    with pytest.raises(InputError, match=r"its data set is not at .*/moved/data\. Put it there"):
-        load_training(beside, "test")
+    for lost, places in ((config, ".*/project/data, nor at .*/moved/data"), (beside, ".*/moved/data")):
+        with pytest.raises(InputError, match=rf"its data set is not at {places}\. Put it there"):
+            load_training(lost, "test")
 
 
 def test_views_of_which_nothing_counts_are_told():
@@ -83,11 +74,9 @@ def random_rotation(seed: int) -> torch.Tensor:
 
 def camera(similarity: Similarity) -> Cameras:
     """Five units before the middle, in a world that was moved."""
-    pose = torch.eye(4, dtype=torch.float64)[:3]
-    pose[2, 3] = 5.0
-    moved = torch.cat([similarity.rotation @ pose[:, :3], similarity.scale * similarity.rotation @ pose[:, 3:]], dim=1)
-    moved[:, 3] += similarity.translation
-    return Cameras(moved[None].float(), fx=60.0, fy=60.0, cx=24.0, cy=18.0, width=48, height=36)[0:1]
+    position = 5.0 * similarity.scale * similarity.rotation[:, 2] + similarity.translation
+    pose = torch.cat([similarity.rotation, position[:, None]], dim=1)
+    return Cameras(pose[None].float(), fx=60.0, fy=60.0, cx=24.0, cy=18.0, width=48, height=36)[0:1]
 
 
 @pytest.mark.parametrize("similarity", [
@@ -105,8 +94,7 @@ def test_the_picture_is_the_same(similarity):
     found = render_splats(moved, camera(similarity), background, scene_unit=similarity.scale)
     # Forty splats' float32 colours and shapes, each rounded a few times at 1e-7 of numbers of up to 10.
     assert_close(found, expected, rtol=0, atol=2e-4)
-    back = similarity.inverse.moved(moved)
-    for name, value in back._asdict().items():
+    for name, value in similarity.inverse.moved(moved)._asdict().items():
         if name == "quats":  # of two opposite ones either is the rotation
             value = value * (value * original.quats).sum(-1, keepdim=True).sign()
         assert_close(value, getattr(original, name), rtol=1e-5, atol=2e-6, msg=name)
@@ -129,6 +117,5 @@ def test_on_screen_is_what_sparks_shader_keeps():
     edge = 24 / 60 * 5  # half of the picture's width at five units
     x = torch.tensor([0.0, 1.0, 1.39, 1.41, -1.39, -1.41]) * edge
     means = torch.stack([x, torch.zeros(6), torch.zeros(6)], dim=-1)
-    behind = torch.tensor([[0.0, 0.0, 6.0]])
-    found = on_screen(torch.cat([means, behind]), camera(NOWHERE))
-    assert found.tolist() == [True, True, True, False, True, False, False]
+    means = torch.cat([means, torch.tensor([[0.0, 0.0, 6.0]])])  # the last is behind
+    assert on_screen(means, camera(NOWHERE)).tolist() == [True, True, True, False, True, False, False]

@@ -17,8 +17,6 @@ from nrfgs_ns.trained.loading import load_model
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
 
-pytest.importorskip("playwright.sync_api", reason="no playwright: pip install -e '.[browser]'")
-
 ALIKE = 40.0
 """dB between the page's picture and the renderer's."""
 MODES = ["full", "base", "residual", "opacity residual"]
@@ -37,7 +35,7 @@ def test_every_kind_of_field_in_every_mode(kind, opened, tmp_path):
     (tmp_path / "page.html").write_text(page_with(scene.read_bytes(), photographs))
     page = opened((tmp_path / "page.html").as_uri())
     for index, photograph in enumerate(photographs):
-        page.visit(index)
+        page.call("visit", index)
         for mode, gain in [("full", 1.0), ("full", 2.0), ("full", 0.35), *((mode, 1.0) for mode in MODES[1:])]:
             page.set("show", mode, "change")
             page.set("gain", str(gain), "input")
@@ -73,7 +71,7 @@ def test_a_demo_scene_is_drawn_as_by_the_renderer(demo, opened, tmp_path):
     pipeline = load_model(config, "test")
     cameras = pipeline.datamanager.train_dataset.cameras
     for index in sorted({about["start"], 0, len(cameras) // 2, len(cameras) - 1})[:3]:
-        page.visit(index)
+        page.call("visit", index)
         picture, photograph = page.picture(), about["photographs"][index]
         assert psnr(picture, rendered(scene, photograph)) >= ALIKE
         assert psnr(picture, pipeline.model.get_outputs_for_camera(cameras[index : index + 1])["rgb"]) >= ALIKE
@@ -96,15 +94,15 @@ def test_a_page_asks_the_network_for_nothing_and_works_in_a_frame(demo, opened, 
     assert all(url.startswith(("file:", "blob:", "data:")) for url in page.requests)
 
 
-def broken_pages(text: str) -> dict[str, tuple[str, str]]:
-    """Fault -> a page with it, and what it says."""
+def test_a_broken_page_says_so(demo, browser, tmp_path):
+    text = demo[1].read_text(encoding="utf-8")
     at = text.index('id="packed"')
     start, middle = text.index(">", at) + 1, at + (len(text) - at) // 2
     scene = base64.b64decode(text[start : text.index("<", start)])
     later = base64.b64encode(scene[:8] + (9).to_bytes(4, "little") + scene[12:]).decode()
     unparsable = text.replace("async function", "async async function", 1)
     letter = "A" if text[middle] != "A" else "B"
-    return {
+    for fault, (broken, said) in {
         "a letter changed": (text[:middle] + letter + text[middle + 1 :], "checksum"),
         "cut short": (text[:middle], "cut short"),
         "without its scene": (text[: text.rindex("<script", 0, at)], "cut short"),
@@ -114,12 +112,8 @@ def broken_pages(text: str) -> dict[str, tuple[str, str]]:
         "scripts that do not parse": (unparsable, "cannot run this page"),
         "not base64": (text[:middle] + "!" + text[middle + 1 :], "damaged"),
         "of a later version": (text[:start] + later + text[text.index("<", start) :], "version"),
-    }
-
-
-def test_a_broken_page_says_so(demo, browser, tmp_path):
-    for fault, (text, said) in broken_pages(demo[1].read_text(encoding="utf-8")).items():
-        (tmp_path / "broken.html").write_text(text, encoding="utf-8")
+    }.items():
+        (tmp_path / "broken.html").write_text(broken, encoding="utf-8")
         page = Page(browser, (tmp_path / "broken.html").as_uri(), (400, 300))
         page.page.wait_for_selector("#failed:not([hidden])")
         assert said in page.page.inner_text("#failed"), fault
@@ -128,17 +122,14 @@ def test_a_broken_page_says_so(demo, browser, tmp_path):
         page.page.close()
 
 
-@pytest.mark.parametrize(
-    "said, before",
-    {
-        "Turn on graphics acceleration": "HTMLCanvasElement.prototype.getContext = () => null",
-        "textures are too small for": "WebGL2RenderingContext.prototype.getParameter = () => 64",
-        "graphics memory is too small": "WebGL2RenderingContext.prototype.getError = () => 0x505",
-        "graphics driver cannot": "WebGL2RenderingContext.prototype.getProgramParameter = () => false",
-        "Something went wrong": "WebGL2RenderingContext.prototype.bufferData = () => { throw Error('raw text') }",
-        "cannot be read": "Worker = null; Uint32Array.prototype.reverse = () => { throw Error('raw text') }",
-    }.items(),
-)
+@pytest.mark.parametrize("said, before", [
+    ("Turn on graphics acceleration", "HTMLCanvasElement.prototype.getContext = () => null"),
+    ("textures are too small for", "WebGL2RenderingContext.prototype.getParameter = () => 64"),
+    ("graphics memory is too small", "WebGL2RenderingContext.prototype.getError = () => 0x505"),
+    ("graphics driver cannot", "WebGL2RenderingContext.prototype.getProgramParameter = () => false"),
+    ("Something went wrong", "WebGL2RenderingContext.prototype.bufferData = () => { throw Error('raw text') }"),
+    ("cannot be read", "Worker = null; Uint32Array.prototype.reverse = () => { throw Error('raw text') }"),
+])  # fmt: skip
 def test_a_browser_that_lacks_something_says_so_in_a_sentence(said, before, demo, browser):
     page = Page(browser, demo[1].as_uri(), before=before)
     page.page.wait_for_selector("#failed:not([hidden])")
@@ -156,8 +147,7 @@ def test_a_folder_on_a_web_server(opened, browser, tmp_path):
     with web_server(folder) as address:
         page = opened(f"{address}/")
         assert psnr(page.picture(), rendered(scene, photographs[0])) >= ALIKE
-        asked = {url.rsplit("/", 1)[1] for url in page.requests if url.startswith("http")}
-        assert asked == {"", "scene.nrf"}
+        assert {url.rsplit("/", 1)[1] for url in page.requests if url.startswith("http")} == {"", "scene.nrf"}
         scene.unlink()
         page = Page(browser, f"{address}/")
         page.page.wait_for_selector("#failed:not([hidden])")

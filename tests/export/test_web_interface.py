@@ -25,14 +25,6 @@ VIEWS = [
 ]
 
 
-def seen_by(page: Page) -> dict:
-    """The camera as a photograph of the page's size, from the interface's matrix and field of view."""
-    matrix = np.array(page.call("getMatrix")).reshape(4, 4).T
-    focal = SIZE[1] / 2 / np.tan(np.radians(page.call("getCamera")["fov"]) / 2)
-    lens = [focal, focal, SIZE[0] / 2, SIZE[1] / 2]
-    return {"pose": matrix[:3].flatten().tolist(), "lens": lens, "size": list(SIZE)}
-
-
 def test_views_set_through_the_interface_are_the_renderers(opened, tmp_path):
     scene, photographs = random_scene(tmp_path, "classic", {})
     (tmp_path / "page.html").write_text(page_with(scene.read_bytes(), photographs))
@@ -41,12 +33,15 @@ def test_views_set_through_the_interface_are_the_renderers(opened, tmp_path):
     for view in VIEWS:
         page.call("setCamera", {"fov": 55} | view)
         by_target, matrix = page.picture(), page.call("getMatrix")
-        assert psnr(by_target, rendered(scene, seen_by(page))) >= ALIKE
-        page.visit(1)
+        pose, focal = np.reshape(matrix, (4, 4)).T[:3], SIZE[1] / 2 / np.tan(np.radians(view.get("fov", 55)) / 2)
+        lens = [focal, focal, SIZE[0] / 2, SIZE[1] / 2]
+        seen = {"pose": pose.flatten().tolist(), "lens": lens, "size": list(SIZE)}
+        assert psnr(by_target, rendered(scene, seen)) >= ALIKE
+        page.call("visit", 1)
         page.call("setCamera", {"matrix": matrix, "fov": view.get("fov", 55)})
         assert psnr(page.picture(), by_target) >= ALIKE
         assert np.allclose(page.call("getMatrix"), matrix, atol=1e-12)
-    page.visit(0)  # its lens is off centre
+    page.call("visit", 0)  # its lens is off centre
     before = page.picture()
     page.page.evaluate("nrfgs.setCamera(nrfgs.getCamera())")
     assert psnr(page.picture(), before) >= 80, "the same, within rounding"
@@ -168,16 +163,14 @@ def test_embedded_where_the_code_says(opened, tmp_path):
 
 WATCH = """
 window.path = [];
-const watch = () => nrfgs.on("moved", ({ position }) => path.push([performance.now(), ...position]));
-addEventListener("DOMContentLoaded", watch);
+const moved = ({ position }) => path.push([performance.now(), ...position]);
+addEventListener("DOMContentLoaded", () => nrfgs.on("moved", moved));
 """
 
 
 def test_a_tour_begins_by_itself_and_goes_smoothly_through_its_views(wall):
-    tour = {"views": [2, 4, VIEWS[0], 8]}
-    page = wall((160, 120), before=WATCH, tour=tour)
-    button = page.page.get_by_role("button", name="Stop tour")
-    assert button.get_attribute("aria-pressed") == "true"
+    page = wall((160, 120), before=WATCH, tour={"views": [2, 4, VIEWS[0], 8]})
+    assert page.page.get_by_role("button", name="Stop tour").get_attribute("aria-pressed") == "true"
     page.until(ENDED)
     path = np.array(page.page.evaluate("path"))
     places = [page.call("photographs")[k]["position"] for k in (2, 4, 8)] + [VIEWS[0]["position"]]
@@ -200,10 +193,9 @@ def test_a_tour_stops_at_the_first_touch(wall):
         page.call("finished")  # it would never end while a tour goes on
     page = wall((400, 300), tour={"views": [0, 8]}, tail="#photograph=5")
     assert page.page.locator("#tour").get_attribute("aria-pressed") == "false", "a link's view is kept"
-    page.page.click("#tour")
-    assert page.page.locator("#tour").get_attribute("aria-pressed") == "true"
-    page.page.click("#tour")
-    assert page.page.locator("#tour").get_attribute("aria-pressed") == "false"
+    for pressed in ("true", "false"):
+        page.page.click("#tour")
+        assert page.page.locator("#tour").get_attribute("aria-pressed") == pressed
     page.page.evaluate("nrfgs.play('tour')")
     page.until(ENDED)
     assert np.allclose(page.camera()[0], page.call("photographs")[8]["position"])
@@ -212,13 +204,12 @@ def test_a_tour_stops_at_the_first_touch(wall):
 
 
 def test_notes_are_at_their_points_and_are_text(wall):
-    camera = {"position": [3, 0, 0], "target": [0, 0, 0]}
     notes = [
         {"text": "<b>left</b> & right", "position": [0, 0.5, 0.3], "camera": VIEWS[0]},
         {"text": "behind", "position": [6, 0, 0]},
     ]
     page = wall((400, 300), notes=notes)
-    page.call("setCamera", camera | {"fov": 50})
+    page.call("setCamera", {"position": [3, 0, 0], "target": [0, 0, 0], "fov": 50})
     page.call("finished")
     box = page.page.get_by_role("button", name="Note 1", exact=True).bounding_box()
     focal = 150 / np.tan(np.radians(25))

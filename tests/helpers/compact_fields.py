@@ -57,32 +57,24 @@ def in_node(code: str, folder: Path, *words: str) -> Any:
     return json.loads(subprocess.run(words, cwd=folder, capture_output=True, check=True, timeout=300).stdout)
 
 
-def field(count: int = 60) -> Field:
+def field(count: int = 60, latent_dim: int = 8, **options) -> Field:
     torch.manual_seed(3)
-    config = NrfConfig(latent_dim=8, hidden_width=16, output_init="default")
-    head = config.setup().requires_grad_(False)
+    options = {"latent_dim": latent_dim, "hidden_width": 16, "output_init": "default"} | options
+    head = NrfConfig(**options).setup().requires_grad_(False)
     splats = {
         "means": torch.randn(count, 3) * torch.tensor([1.0, 5.0, 0.2]),
         "quats": torch.randn(count, 4) * 3,
         "scales": torch.randn(count, 3) - 4,
         "opacities": torch.randn(count, 1) * 4,
         "features_dc": torch.randn(count, 3),
-        "latents": torch.randn(count, 8) * torch.linspace(2.0, 0.1, 8),
+        "latents": torch.randn(count, latent_dim) * torch.linspace(2.0, 0.1, latent_dim),
     }
     return Field(head, splats)
 
 
 def through_a_file(one: Field, tmp_path: Path) -> Decoded:
-    header, streams = encode(one, RENDER)
-    write_container(tmp_path / "f.nrf", header, streams)
+    write_container(tmp_path / "f.nrf", *encode(one, RENDER))
     return decode(tmp_path / "f.nrf")
-
-
-def matched(one: Field, found: dict) -> torch.Tensor:
-    """The row of the field that each row of the file came from: the nearest mean."""
-    rows = torch.cdist(found["means"].double(), one.splats["means"].double()).argmin(dim=1)
-    assert len(rows.unique()) == len(rows)
-    return rows
 
 
 def plain_splats(count: int) -> PlainSplats:

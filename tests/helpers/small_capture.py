@@ -28,8 +28,7 @@ class Capture:
         frames = []
         for i in reversed(range(images)):  # out of order: the split goes by sorted name
             name = f"images/{i:03d}.png"
-            pixels = self.rng.integers(0, 256, (self.height, self.width, 3), dtype=np.uint8)
-            Image.fromarray(pixels).save(folder / name)
+            Image.fromarray(self.rng.integers(0, 256, (self.height, self.width, 3), dtype=np.uint8)).save(folder / name)
             frames.append({"file_path": name, "transform_matrix": self.pose(2 * np.pi * i / images).tolist()})
         intrinsics = {"fl_x": 10.0, "fl_y": 11.0, "cx": 6.0, "cy": 4.5}
         self.meta = {**intrinsics, "w": self.width, "h": self.height, "frames": frames}

@@ -30,17 +30,12 @@ class Model:
 
     def binary(self) -> dict[str, bytes]:
         cameras = [struct.pack(f"<iiQQ{len(p)}d", i, m, w, h, *p) for i, m, w, h, p in self.cameras]
+        feature, track = struct.pack("<Qddq", 1, 3.0, 4.0, -1), struct.pack("<iiii", 1, 0, 2, 0)
         images = [
-            struct.pack("<i7di", i, *q, *t, c)
-            + name.encode("utf-8", "surrogatepass")
-            + b"\0"
-            + struct.pack("<Qddq", 1, 3.0, 4.0, -1)
+            struct.pack("<i7di", i, *q, *t, c) + name.encode("utf-8", "surrogatepass") + b"\0" + feature
             for i, q, t, c, name in self.images
         ]
-        points = [
-            struct.pack("<Q3d3BdQ", i, *xyz, *rgb, 0.5, self.tracks) + struct.pack("<iiii", 1, 0, 2, 0)
-            for i, xyz, rgb in self.points
-        ]
+        points = [struct.pack("<Q3d3BdQ", i, *xyz, *rgb, 0.5, self.tracks) + track for i, xyz, rgb in self.points]
         return {
             file: struct.pack("<Q", self.counts.get(file, len(rows))) + b"".join(rows)
             for file, rows in zip(FILES, (cameras, images, points), strict=True)
@@ -64,6 +59,5 @@ class Model:
             (folder / MODEL / f"{file}.{'txt' if text else 'bin'}").write_bytes(content)
         rng = np.random.default_rng(0)
         for i in range(10):
-            pixels = rng.integers(0, 256, (9, 12, 3), dtype=np.uint8)
-            Image.fromarray(pixels).save(folder / "images" / f"{i:03d}.png")
+            Image.fromarray(rng.integers(0, 256, (9, 12, 3), dtype=np.uint8)).save(folder / "images" / f"{i:03d}.png")
         return folder

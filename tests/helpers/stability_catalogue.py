@@ -34,6 +34,7 @@ HEAD, RASTER = "tests/appearance/test_stability_head.py", "tests/rasterizer/test
 GUARD, PROJECTION = "tests/training/test_guard.py", "tests/rasterizer/test_tiles.py"
 SIDE = 16
 """Pixels along a side of the image that the checks draw."""
+SHAPE = {"means": [0.0, 0.0, 2.0], "quats": [1.0, 0.0, 0.0, 0.0], "scales": [0.1] * 3}
 
 
 @dataclass
@@ -56,12 +57,9 @@ def finite(*tensors: Tensor) -> bool:
 
 def draw(**changed: list[float] | float) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     """Opacity [H, W] and colour [H, W, 3] of one splat at depth 2, and its tensors with gradients."""
-    values = {"means": [0.0, 0.0, 2.0], "quats": [1.0, 0.0, 0.0, 0.0], "scales": [0.1] * 3, "colors": [0.5] * 3}
-    splat = {name: torch.tensor([changed.get(name, value)]) for name, value in values.items()}
-    splat["opacities"] = torch.tensor([changed.get("opacities", 0.5)])
-    splat = {name: value.requires_grad_() for name, value in splat.items()}
-    order = ("means", "quats", "scales", "opacities", "colors")
-    image, alpha, _ = rasterization(*(splat[name] for name in order), *camera())
+    values = SHAPE | {"opacities": 0.5, "colors": [0.5] * 3}
+    splat = {name: torch.tensor([changed.get(name, value)]).requires_grad_() for name, value in values.items()}
+    image, alpha, _ = rasterization(*splat.values(), *camera())
     (image.sum() + alpha.sum()).backward()
     return alpha[0, ..., 0].detach(), image[0].detach(), splat
 
@@ -74,8 +72,7 @@ def camera() -> tuple[Tensor, Tensor, int, int]:
 
 def sees(mode: str = "classic", **changed: list[float]) -> Projection:
     """Projection of one splat."""
-    values = {"means": [0.0, 0.0, 2.0], "quats": [1.0, 0.0, 0.0, 0.0], "scales": [0.1] * 3}
-    splat = (torch.tensor([changed.get(name, value)]) for name, value in values.items())
+    splat = (torch.tensor([changed.get(name, value)]) for name, value in SHAPE.items())
     return project(*splat, *camera(), ProjectionOptions(mode))
 
 

@@ -13,15 +13,16 @@ from pathlib import Path
 import numpy as np
 import torch
 from compact_fields import write_container
+from nerfstudio.cameras.cameras import Cameras
 from PIL import Image
 
+from nrfgs_lab.scenes.cameras import look_at
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NrfConfig
-from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import encode
 from nrfgs_ns.export.web.page import page as page_of
-from nrfgs_ns.model.renderer import Pinhole, composite_view, project_view, projection_options, world_to_camera
-from nrfgs_ns.viewer.pictures import AMPLIFICATION, GREY, OPACITY_AXIS, with_gain
+from nrfgs_ns.trained.loading import load_file
+from nrfgs_ns.viewer.pictures import BASE, FULL, GREY, PictureOptions, legends, picture
 
 SIZE = (320, 240)
 
@@ -42,10 +43,6 @@ class Page:
             self.page.add_init_script(before)
         self.page.goto(address)
 
-    def begun(self) -> "Page":
-        self.page.evaluate("nrfgs.ready")
-        return self
-
     def picture(self) -> torch.Tensor:
         """What the canvas shows when it is finished, [H, W, 3] in [0, 1]."""
         address = self.page.evaluate("nrfgs.finished().then(() => nrfgs.picture())")
@@ -55,9 +52,6 @@ class Page:
     def call(self, name: str, *arguments):
         """Call a function of the page's interface; a promise is waited for."""
         return self.page.evaluate("([name, given]) => nrfgs[name](...given)", [name, list(arguments)])
-
-    def visit(self, index: int) -> None:
-        self.call("visit", index)
 
     def until(self, condition: str) -> None:
         """Wait for a condition; the page's policy forbids what Playwright's own waiting needs."""
@@ -125,8 +119,7 @@ def random_scene(folder: Path, mode: str, options: dict) -> tuple[Path, list[dic
 
 
 def wall_scene(folder: Path) -> tuple[Path, list[dict]]:
-    """An opaque wall at x = 0, 4 x 4, and nine photographs from x = 3, which take its distance for 5: as if they looked
-    through it."""
+    """An opaque wall at x = 0, 4 x 4, and nine photographs from x = 3, which take its distance for 5."""
     y, z = torch.meshgrid(torch.linspace(-2, 2, 33), torch.linspace(-2, 2, 33), indexing="ij")
     means = torch.stack([torch.zeros_like(y), y, z], dim=-1).reshape(-1, 3)
     torch.manual_seed(5)
@@ -138,10 +131,8 @@ def wall_scene(folder: Path) -> tuple[Path, list[dict]]:
         "features_dc": torch.randn(len(means), 3),
     }
     eyes = [[3.0, 0.5 * (k % 3 - 1), 0.5 * (k // 3 - 1)] for k in range(9)]
-    aims = [[0.0, *eye[1:]] for eye in eyes]
-    return written(folder, splats, "classic", {}), [
-        photograph(str(k), eye, aim) | {"distance": 5.0} for k, (eye, aim) in enumerate(zip(eyes, aims, strict=True))
-    ]
+    photographs = [photograph(str(k), eye, [0.0, *eye[1:]]) | {"distance": 5.0} for k, eye in enumerate(eyes)]
+    return written(folder, splats, "classic", {}), photographs
 
 
 def written(folder: Path, splats: dict[str, torch.Tensor], mode: str, options: dict) -> Path:
@@ -150,23 +141,17 @@ def written(folder: Path, splats: dict[str, torch.Tensor], mode: str, options: d
     head.scene_unit = 0.7
     for weight in head.parameters():
         weight.mul_(2.0)
-    count = len(splats["means"])
-    splats["latents"] = torch.randn(count, head.config.latent_dim)
-    header, streams = encode(Field(head, splats), {"rasterize_mode": mode, "background": [0.1, 0.2, 0.3]})
-    write_container(folder / "scene.nrf", header, streams)
+    splats["latents"] = torch.randn(len(splats["means"]), head.config.latent_dim)
+    render = {"rasterize_mode": mode, "background": [0.1, 0.2, 0.3]}
+    write_container(folder / "scene.nrf", *encode(Field(head, splats), render))
     return folder / "scene.nrf"
 
 
 def photograph(name: str, eye: list[float], aim: list[float] | None = None) -> dict:
     """A photograph's values in a page, from a place towards another, the origin."""
-    eye = torch.tensor(eye)
-    back = eye - torch.tensor(aim or [0.0, 0.0, 0.0])
-    distance = float(back.norm())
-    back = back / distance
-    right = torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0]), back)
-    right = right / right.norm()
-    pose = torch.stack([right, torch.linalg.cross(back, right), back, eye], dim=1)
-    place = {"name": f"{name}.png", "pose": pose.flatten().tolist(), "distance": distance}
+    eye, aim = np.array(eye), np.array(aim or [0.0, 0.0, 0.0])
+    pose, distance = look_at(eye, aim)[:3].flatten().tolist(), float(np.linalg.norm(eye - aim))
+    place = {"name": f"{name}.png", "pose": pose, "distance": distance}
     return {**place, "lens": [260.0, 250.0, 150.0, 130.0], "size": list(SIZE)}
 
 
@@ -178,28 +163,15 @@ def page_with(scene: bytes | str, photographs: list[dict], **more) -> str:
     return page_of(about, poster.getvalue(), scene, "Splats <1 & 2>", 'Me & "you"')
 
 
-def rendered(scene: Path, photograph: dict, mode: str = "full", gain: float = 1.0) -> torch.Tensor:
-    """What this project draws of a compact file, [H, W, 3] in [0, 1]."""
-    decoded = decode(scene)
-    head = decoded.config.setup().requires_grad_(False)
-    head.load_state_dict(decoded.weights)
-    head.scene_unit = decoded.header["head"]["scene_unit"]
-    field = Field(head, dict(decoded.splats))
-    pose = torch.tensor(photograph["pose"]).view(1, 3, 4)
-    fx, fy, cx, cy = photograph["lens"]
-    lens = torch.tensor([[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]])
-    camera = Pinhole(world_to_camera(pose), lens, *photograph["size"], pose[0, :, 3])
-    options = projection_options(decoded.header["render"]["rasterize_mode"], head.scene_unit)
-    view = project_view(field.splats, camera, options)
-    appearance = with_gain(field, view, 0.0 if mode == "base" else gain)
-    background = torch.tensor(decoded.header["render"]["background"])
-    if mode.endswith("residual"):
-        component = field.components_of(view).get(mode)
-        change = torch.zeros(len(appearance.colors), 1) if component is None else component.values
-        change = change * torch.tensor(OPACITY_AXIS) if mode == "opacity residual" else change
-        appearance = appearance._replace(colors=GREY + AMPLIFICATION * gain * change.expand(-1, 3))
-        background = torch.full((3,), GREY)
-    return composite_view(view, appearance, background)[0]["rgb"]
+@torch.no_grad()
+def rendered(scene: Path, photograph: dict, mode: str = FULL, gain: float = 1.0) -> torch.Tensor:
+    """What this project draws of a compact file, [H, W, 3] in [0, 1]; grey is no change of what a field lacks."""
+    model, (width, height) = load_file(scene), photograph["size"]
+    mode = BASE if mode == "base" else mode  # which the page calls so
+    if mode not in legends(model.field):
+        return torch.full((height, width, 3), GREY)
+    camera = Cameras(torch.tensor(photograph["pose"]).view(1, 3, 4), *photograph["lens"], width, height)
+    return picture(model, camera, PictureOptions(mode, gain=gain))["rgb"]
 
 
 @contextlib.contextmanager

@@ -23,8 +23,7 @@ def test_demo_trains_compares_and_writes_pictures(tmp_path, capfd, monkeypatch):
     shown = capfd.readouterr().out
     assert "ns-train nrfgs-sh --data" in shown and all(f" {label} " in shown for label in METHODS.values())
     assert "Too short for a verdict" in shown and results["verdict"].startswith("Too short")
-    config = results["methods"][NRF]["train"]["config_path"]
-    assert f"nrfgs view {config}" in shown.replace("\n", "")
+    assert f"nrfgs view {results['methods'][NRF]['train']['config_path']}" in shown.replace("\n", "")
     for result in results["methods"].values():
         assert result["train"]["steps"] == 6 and result["train"]["processor_seconds"] > 0
         assert result["eval"]["splats"] == 500  # as many as points: none come, none go
@@ -36,12 +35,6 @@ def test_demo_trains_compares_and_writes_pictures(tmp_path, capfd, monkeypatch):
     assert strip.width >= FRAMES * CELL and strip.height >= 5 * 0.7 * CELL
 
 
-def compared(nrf, sh):
-    whole = {"psnr": 25.0, "ssim": 0.8}
-    field = {"views": nrf, "views_base": [20.0, 20.5, 20.1]}
-    return {NRF: {"eval": whole, "shine": field}, SH: {"eval": whole, "shine": {"views": sh}}}
-
-
 @pytest.mark.parametrize("nrf, sh, steps, says", [
     ([25.0, 25.2, 26.0], [24.0, 24.0, 24.9], ENOUGH_STEPS, "NRF is ahead of SH: +1.10 dB"),
     ([25.0, 25.1, 25.1], [25.0, 25.0, 25.0], ENOUGH_STEPS, "No clear difference"),  # little
@@ -49,7 +42,9 @@ def compared(nrf, sh):
     ([25.0, 25.2, 26.0], [24.0, 24.0, 24.9], ENOUGH_STEPS - 1, "Too short for a verdict"),
 ])  # fmt: skip
 def test_the_verdict_follows_the_measurement(nrf, sh, steps, says):
-    assert verdict(compared(nrf, sh), steps).startswith(says)
+    whole, field = {"psnr": 25.0, "ssim": 0.8}, {"views": nrf, "views_base": [20.0, 20.5, 20.1]}
+    compared = {NRF: {"eval": whole, "shine": field}, SH: {"eval": whole, "shine": {"views": sh}}}
+    assert verdict(compared, steps).startswith(says)
 
 
 def test_where_it_shines_is_where_gloss_changes_the_truth():

@@ -21,10 +21,7 @@ from nrfgs_ns.viewer.pictures import BASE, DEPTH, FULL, PictureOptions, legends,
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
 
-METHODS = ["nrfgs-deferred", "nrfgs-latent-spec"]
-
-
-@pytest.fixture(scope="module", params=METHODS)
+@pytest.fixture(scope="module", params=["nrfgs-deferred", "nrfgs-latent-spec"])
 def finished(request, tiny_scene, tmp_path_factory) -> tuple[str, Path]:
     """A method and the config.yml of its training."""
     return request.param, trained(command_line(request.param, tiny_scene, tmp_path_factory.mktemp("out"), 20))
@@ -61,9 +58,9 @@ def test_gradients_agree_with_finite_differences(name):
         def forward(self, *values):
             splats = {**dict(zip(stored, values, strict=True)), "quats": quats, "scales": scales}
             view = project_view(splats, camera, projection_options("classic", 1.0))
-            look = lambda rgb: rgb  # noqa: E731  (not clamped)
             seen = Field(head, splats).seen_from(view)
-            return composite_view(view, seen, background, image_of=head.image_of, look=look)[0]["rgb"]
+            not_clamped = {"look": lambda rgb: rgb}
+            return composite_view(view, seen, background, image_of=head.image_of, **not_clamped)[0]["rgb"]
 
     drawn = Drawn()
 
@@ -79,11 +76,9 @@ def test_it_learns(finished, tiny_scene, tmp_path):
     """After 60 steps test views are a decibel closer than after one."""
     method, _ = finished
     options = {"--pipeline.model.num-downscales": 0}
-    scores = [
-        evaluate(trained(command_line(method, tiny_scene, tmp_path / str(n), n, options)), tmp_path / "e.json")["psnr"]
-        for n in (1, 60)
-    ]
-    assert scores[1] > scores[0] + 1.0
+    configs = [trained(command_line(method, tiny_scene, tmp_path / str(n), n, options)) for n in (1, 60)]
+    untrained, learnt = (evaluate(config, tmp_path / "eval.json")["psnr"] for config in configs)
+    assert learnt > untrained + 1.0
 
 
 @pytest.mark.parametrize("command", [Ply, Compact, Web])

@@ -2,19 +2,18 @@
 """Procedural scenes: geometry and shading; and the written data set, which nerfstudio reads."""
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
-from plyfile import PlyData
 
 from nrfgs_lab.scenes import SceneConfig, build_scene, camera_rays, dome_cameras, write_scene
 from nrfgs_lab.scenes.cameras import project
 from nrfgs_lab.scenes.dataset import sparse_points, split_names
 from nrfgs_lab.scenes.geometry import CAMERA, FIRST_SOLID, GROUND, SKY, Box, Sphere, World
 from nrfgs_lab.scenes.shading import tone_curve
+from nrfgs_ns.data.points import read_ply
 
 SPHERE = Sphere((0.3, -0.2, 0.7), 0.7)
 BOX = Box((-0.9, 0.8, 0.5), (0.3, 0.4, 0.5), yaw=0.6)
@@ -33,9 +32,6 @@ def signed_distance_box(p):
     return np.linalg.norm(np.maximum(q, 0.0), axis=-1) + np.minimum(q.max(axis=-1), 0.0)
 
 
-SOLIDS = [pytest.param(SPHERE, signed_distance_sphere, id="sphere"), pytest.param(BOX, signed_distance_box, id="box")]
-
-
 def random_rays(count, seed=0):
     """Rays from a shell about the scene towards its middle, so that about half of them hit something. [N, 3] each."""
     rng = np.random.default_rng(seed)
@@ -46,7 +42,7 @@ def random_rays(count, seed=0):
     return origins, directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize(("solid", "signed_distance"), SOLIDS)
+@pytest.mark.parametrize("solid, signed_distance", [(SPHERE, signed_distance_sphere), (BOX, signed_distance_box)])
 def test_normals_are_unit_and_the_gradient_of_distance(solid, signed_distance):
     origins, directions = random_rays(400)
     enter, leave = solid.interval(origins.T, directions.T)
@@ -83,33 +79,16 @@ def test_first_hit_is_the_nearest_surface_and_the_world_is_closed():
     np.testing.assert_allclose(t, distance, atol=1e-6)
 
 
-SMALL = dict(views=12, width=40, height=30)
-
-
-def surface_points(scene, count=600, seed=0):
-    """Points [N, 3] that the cameras see, and their surfaces [N]. float64."""
-    config = scene.config
-    rng = np.random.default_rng(seed)
-    cameras = dome_cameras(config)[rng.integers(config.views, size=count)]
-    pixels = rng.uniform((0, 0), (config.width, config.height), size=(count, 2))
-    origins, directions = (a.astype(np.float64) for a in camera_rays(config, cameras, pixels))
-    return scene.first_hit(origins, directions)
-
-
-def views_above(scene, points, surfaces, count, seed=1):
-    """Directions [count, N, 3] uniform over the hemisphere that each surface point can be seen from."""
-    normals = scene.world.normals(points.T, surfaces).T
-    directions = np.random.default_rng(seed).normal(size=(count, len(points), 3))
-    directions *= np.sign((directions * normals).sum(-1, keepdims=True))
-    return directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-
-
 def view_variance(gloss):
-    """Mean over points and channels of the variance over views of the radiance."""
-    scene = build_scene(SceneConfig(gloss=gloss, **SMALL))
-    points, surfaces = surface_points(scene, 300)
-    radiance = [scene.outgoing_radiance(points, surfaces, v) for v in views_above(scene, points, surfaces, 8)]
-    return np.var(radiance, axis=0).mean()
+    """Mean, over 300 points that cameras see, of the radiance's variance over 8 directions, all from above."""
+    config, rng = SceneConfig(gloss=gloss, views=12, width=40, height=30), np.random.default_rng(0)
+    scene, cameras = build_scene(config), dome_cameras(config)[rng.integers(12, size=300)]
+    rays = camera_rays(config, cameras, rng.uniform((0, 0), (40, 30), size=(300, 2)))
+    points, surfaces = scene.first_hit(*(vectors.astype(np.float64) for vectors in rays))
+    directions = np.random.default_rng(1).normal(size=(8, 300, 3))
+    directions *= np.sign((directions * scene.world.normals(points.T, surfaces).T).sum(-1, keepdims=True))
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    return np.var([scene.outgoing_radiance(points, surfaces, v) for v in directions], axis=0).mean()
 
 
 def test_view_dependence_grows_with_gloss():
@@ -134,23 +113,12 @@ def glossy(tmp_path_factory):
     return write_scene(GLOSSY, tmp_path_factory.mktemp("scenes") / "glossy")
 
 
-def load(folder):
-    """transforms.json, images by path as floats [H, W, 3] in [0, 1], points [P, 3], colours [P, 3] in [0, 1]."""
-    transforms = json.loads((folder / "transforms.json").read_text())
-    images = {f["file_path"]: np.asarray(Image.open(folder / f["file_path"])) / 255.0 for f in transforms["frames"]}
-    vertex = PlyData.read(str(folder / "sparse.ply"))["vertex"]
-    points = np.stack([vertex[name] for name in ("x", "y", "z")], axis=1).astype(np.float64)
-    colours = np.stack([vertex[name] for name in ("red", "green", "blue")], axis=1) / 255.0
-    return transforms, images, points, colours
-
-
 def test_pictures_are_what_nerfstudios_rays_see(matt):
     """Through every pixel centre, with the split that was meant."""
     parser = NerfstudioDataParserConfig(
         data=matt, orientation_method="none", center_method="none", auto_scale_poses=False, load_3D_points=False
     ).setup()
-    _, images, _, _ = load(matt)
-    scene, names = build_scene(MATT), []
+    scene = build_scene(MATT)
     for split, expected in zip(("train", "test"), split_names(MATT), strict=True):
         outputs = parser.get_dataparser_outputs(split)
         names = [path.relative_to(matt).as_posix() for path in outputs.image_filenames]
@@ -158,13 +126,14 @@ def test_pictures_are_what_nerfstudios_rays_see(matt):
         rays = outputs.cameras.generate_rays(camera_indices=1)
         seen = scene.radiance(*(vectors.reshape(-1, 3).numpy() for vectors in (rays.origins, rays.directions)))
         # To a byte, except at edges, where rounding decides which side a ray falls on.
-        off = np.abs(tone_curve(seen).reshape(72, 96, 3) - images[names[1]]).max(axis=-1) > 0.55 / 255
+        image = np.asarray(Image.open(matt / names[1])) / 255.0
+        off = np.abs(tone_curve(seen).reshape(72, 96, 3) - image).max(axis=-1) > 0.55 / 255
         assert off.mean() < 2e-3, off.mean()
 
 
 def test_points_lie_where_pictures_show_them(matt):
     """Without gloss a point has its colour in every view, and in the picture where it is projected to."""
-    _, _, points, colours = load(matt)
+    points, colours = read_ply(matt / "sparse.ply")
     scene, seen = build_scene(MATT), 0
     for camera in dome_cameras(MATT):
         pixels, depth = project(MATT, camera, points)
@@ -175,22 +144,21 @@ def test_points_lie_where_pictures_show_them(matt):
         shown = tone_curve(scene.radiance(origins[here], directions[here]))
         seen += here.sum()
         # Half a byte of rounding, and a texture's change within the tolerance of a hit.
-        assert np.abs(shown - colours[inside][here]).mean() < 0.5 / 255
+        assert np.abs(shown - colours[inside][here] / 255.0).mean() < 0.5 / 255
     assert seen > 5000
 
 
 def test_rerun_is_identical_to_the_byte_and_points_come_from_training_views_alone(glossy, tmp_path):
     again = write_scene(GLOSSY, tmp_path / "deep" / "again")
-    first = {p.relative_to(glossy): p.read_bytes() for p in sorted(glossy.rglob("*")) if p.is_file()}
-    second = {p.relative_to(again): p.read_bytes() for p in sorted(again.rglob("*")) if p.is_file()}
-    assert first == second
+    first = {p.relative_to(glossy): p.read_bytes() for p in glossy.rglob("*") if p.is_file()}
+    assert first == {p.relative_to(again): p.read_bytes() for p in again.rglob("*") if p.is_file()}
     assert len(first) == GLOSSY.views + 3
     assert [p.name for p in (tmp_path / "deep").iterdir()] == ["again"]  # nothing of the staging is left
-    _, _, points, colours = load(glossy)
+    points, colours = read_ply(glossy / "sparse.ply")
     training = np.delete(dome_cameras(GLOSSY), [0, 8], axis=0)
     expected_points, expected_colours = sparse_points(build_scene(GLOSSY), training)
     np.testing.assert_array_equal(points, expected_points)
-    np.testing.assert_array_equal(np.rint(255.0 * colours), np.rint(255.0 * expected_colours))
+    np.testing.assert_array_equal(colours, np.rint(255.0 * expected_colours))
 
 
 def test_other_content_is_refused(glossy, tmp_path):

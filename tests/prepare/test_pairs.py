@@ -17,17 +17,13 @@ def descriptors(rng: np.random.Generator, number: int) -> np.ndarray:
     return (rng.integers(64, 256, (number, 128)) * (rng.random((number, 128)) < 0.15)).astype(np.uint8)
 
 
-def ring(count: int) -> list[np.ndarray]:
-    """Descriptors of photographs around a thing: each shares 20 features with the next."""
-    rng = np.random.default_rng(0)
-    between = [descriptors(rng, 20) for _ in range(count)]
-    return [np.concatenate([between[i], between[i - 1], descriptors(rng, 5)]) for i in range(count)]
-
-
 @pytest.mark.parametrize("count", [6, 2 * pairs.AT_ONCE + 3])
 def test_shared_features_are_counted(count):
-    done = []
-    shared = pairs.shared_features([*ring(count), np.zeros((0, 128), np.uint8)], done.append)
+    """Around a thing, where each photograph shares 20 features with the next."""
+    rng, done = np.random.default_rng(0), []
+    between = [descriptors(rng, 20) for _ in range(count)]
+    ring = [np.concatenate([between[i], between[i - 1], descriptors(rng, 5)]) for i in range(count)]
+    shared = pairs.shared_features([*ring, np.zeros((0, 128), np.uint8)], done.append)
     neighbours = np.roll(np.eye(count, dtype=int), 1, axis=1)
     assert (shared[:-1, :-1] == 20 * (neighbours + neighbours.T)).all() and sum(done) == count + 1
     assert (shared[-1] == 0).all() and (shared[:, -1] == 0).all(), "a photograph without features"

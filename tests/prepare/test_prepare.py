@@ -7,13 +7,14 @@ import math
 import shutil
 import sys
 from pathlib import Path
-from unittest.mock import Mock
+from unittest.mock import DEFAULT, Mock
 
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 from rich.console import Console
+from scipy.spatial.transform import Rotation
 
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.errors import InputError
@@ -52,12 +53,8 @@ def walk(count: int) -> list[np.ndarray]:
 def render_walls(pose: np.ndarray) -> Image.Image:
     """Noise of three sizes on a wall at depth 6 and on a smaller one at depth 4, looked up at the nearest texel."""
     rng = np.random.default_rng(0)
-    texture = sum(
-        np.asarray(
-            Image.fromarray(rng.random((n, n)).astype(np.float32)).resize((1024, 1024), Image.Resampling.BICUBIC)
-        )
-        for n in (32, 96, 256)
-    )
+    noise = [Image.fromarray(rng.random((n, n)).astype(np.float32)) for n in (32, 96, 256)]
+    texture = sum(np.asarray(image.resize((1024, 1024), Image.Resampling.BICUBIC)) for image in noise)
     u, v = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
     rays = np.stack([u / FOCAL, v / FOCAL, np.ones_like(u)], axis=-1) @ pose[:3, :3].T
     image = np.zeros((HEIGHT, WIDTH))
@@ -96,14 +93,12 @@ def run_quietly(source: Path, out: Path, **options) -> str:
 def aligned(found: np.ndarray, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Position errors [V] in the units of `given`, and angles [V] in degrees, of poses [V, 4, 4] after the similarity
     that brings their centres closest (Umeyama 1991)."""
-    x, y = found[:, :3, 3], given[:, :3, 3]
-    u, s, vt = np.linalg.svd((y - y.mean(0)).T @ (x - x.mean(0)))
-    flip = np.diag([1, 1, np.linalg.det(u @ vt)])
-    rotation = u @ flip @ vt
-    scale = (s * np.diag(flip)).sum() / ((x - x.mean(0)) ** 2).sum()
-    errors = np.linalg.norm(scale * (x - x.mean(0)) @ rotation.T + y.mean(0) - y, axis=1)
-    cosines = (np.einsum("ab,vbc,vac->v", rotation, found[:, :3, :3], given[:, :3, :3]) - 1) / 2
-    return errors, np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+    x, y = (poses[:, :3, 3] - poses[:, :3, 3].mean(0) for poses in (found, given))
+    rotation = Rotation.align_vectors(y, x)[0]
+    scale = (rotation.apply(x) * y).sum() / (x**2).sum()
+    errors = np.linalg.norm(scale * rotation.apply(x) - y, axis=1)
+    ours, theirs = (Rotation.from_matrix(poses[:, :3, :3]) for poses in (found, given))
+    return errors, np.degrees((rotation * ours * theirs.inv()).magnitude())
 
 
 def frames_of(scene: Path) -> tuple[dict, np.ndarray]:
@@ -141,8 +136,7 @@ def test_the_scene_is_read_by_the_data_parser(prepared):
     assert verdict["registered"] == verdict["photographs"] == 6
     assert verdict["points"] == len(outputs.metadata["points3D_xyz"]) and 0 < verdict["mean_reprojection_error_px"] < 1
     for factor in (2, 4, 8):  # the cameras of a copy have its size
-        config = NrfgsDataParserConfig(data=prepared, downscale_factor=factor)
-        smaller = config.setup().get_dataparser_outputs("train")
+        smaller = NrfgsDataParserConfig(data=prepared, downscale_factor=factor).setup().get_dataparser_outputs("train")
         with Image.open(smaller.image_filenames[0]) as image:
             assert image.size == (int(smaller.cameras.width[0]), int(smaller.cameras.height[0]))
             assert f"images_{factor}" in str(smaller.image_filenames[0])
@@ -164,18 +158,17 @@ def test_points_are_where_the_cameras_see_them(prepared):
 
 
 def test_finished_work_is_not_repeated_and_changes_are_noticed(prepared, walls, tmp_path, monkeypatch):
-    out, source = tmp_path / "scene", tmp_path / "photos"
-    shutil.copytree(prepared, out)
-    shutil.copytree(walls, source)
+    out, source = shutil.copytree(prepared, tmp_path / "scene"), shutil.copytree(walls, tmp_path / "photos")
     for name in ("extract_features", "match_features", "find_cameras", "undistort"):
         monkeypatch.setattr(structure, name, Mock(side_effect=TypeError))
     said = run_quietly(source, out)
     assert "6 of 6 photographs" in said and "ns-train nrfgs" in said
 
-    with pytest.raises(TypeError):  # another option: everything from the features on, whose function is gone
-        run_quietly(source, out, features=100)
-    with pytest.raises(TypeError):  # and back: what was overwritten is not taken for finished
-        run_quietly(source, out)
+    # Another option: everything from the features on, whose function is gone; and back: what was overwritten is not
+    # taken for finished.
+    for options in ({"features": 100}, {}):
+        with pytest.raises(TypeError):
+            run_quietly(source, out, **options)
     shutil.rmtree(out)
     shutil.copytree(prepared, out)
     (source / "IMG 03.png").write_bytes((source / "IMG 02.png").read_bytes())
@@ -188,21 +181,13 @@ def test_finished_work_is_not_repeated_and_changes_are_noticed(prepared, walls, 
 
 def test_interrupted_features_are_taken_up(walls, tmp_path, monkeypatch):
     """Killed after the first photographs: COLMAP is then asked for all, and keeps what its database has."""
-    real, calls = structure.colmap().extract_features, []
-
-    def dying(*args, **options):
-        calls.append(options["image_names"])
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        real(*args, **options)
-
+    dying = Mock(wraps=structure.colmap().extract_features, side_effect=[DEFAULT, KeyboardInterrupt])
     monkeypatch.setattr(structure.os, "cpu_count", lambda: 4)
     run = Run(Prepare(walls, tmp_path / "scene"), Console(quiet=True))
     run.import_input()
-    monkeypatch.setattr(structure.colmap(), "extract_features", dying)
-    with pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(structure.colmap(), "extract_features", dying)
         run.find_features()
-    monkeypatch.setattr(structure.colmap(), "extract_features", real)
 
     def with_features() -> list[bool]:
         with structure.colmap().Database.open(run.database) as database:
@@ -227,8 +212,7 @@ def test_photographs_that_show_nothing_in_common_are_told(tmp_path):
 def test_global_mapping_helps_out_and_finds_the_same(prepared, walls, tmp_path, monkeypatch):
     """As where incremental mapping finds no two photographs to begin with: all straight ahead."""
     monkeypatch.setattr(structure, "_map_incrementally", lambda *_: [])
-    out = tmp_path / "scene"
-    shutil.copytree(prepared, out)
+    out = shutil.copytree(prepared, tmp_path / "scene")
     shutil.rmtree(out / "work" / "model")
     assert "6 of 6 photographs" in run_quietly(walls, out)
     verdict, before = verdict_of(out), verdict_of(prepared)
@@ -289,8 +273,7 @@ def test_what_is_refused_before_any_work(three, tmp_path, monkeypatch):
     ("database.db", "no database", "COLMAP stops with"),
 ])  # fmt: skip
 def test_damaged_work_is_told_in_one_sentence(prepared, walls, tmp_path, file, content, said):
-    out = tmp_path / "scene"
-    shutil.copytree(prepared, out)
+    out = shutil.copytree(prepared, tmp_path / "scene")
     shutil.rmtree(out / "work" / "model")
     (out / "work" / file).write_text(content)
     with pytest.raises(InputError, match=said):
@@ -326,8 +309,7 @@ def test_photographs_are_kept_or_made_upright(tmp_path):
     exif[ExifTags.Base.Orientation], exif[ExifTags.Base.Model] = 6, "Camera"
     plain, turned = photo(tmp_path / "a b.JPG"), photo(tmp_path / "c.jpg", (40, 30), exif=exif)
     Image.new("RGBA", (40, 30), (255, 0, 0, 0)).save(tmp_path / "d.png")
-    paths = [plain, turned, tmp_path / "d.png", photo(tmp_path / "e.bmp")]
-    done = []
+    paths, done = [plain, turned, tmp_path / "d.png", photo(tmp_path / "e.bmp")], []
     photos.import_photos(paths, tmp_path / "stored" / "photos", done.append)
     stored = {path.name: path for path in (tmp_path / "stored" / "photos").iterdir()}
     assert set(stored) == {"a_b.jpg", "c.jpg", "d.png", "e.png"} and len(done) == 4
@@ -347,11 +329,8 @@ def test_photographs_are_kept_or_made_upright(tmp_path):
 def test_focal_lengths_follow_photographs_that_were_made_smaller(tmp_path, make, width, tags, focal_length):
     exif = Image.Exif()
     exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = make, f"{make} EOS 5D Mark II"
-    tags = {
-        "FocalLength": IFDRational(8 if tags else 50),
-        "ExifImageWidth": width,
-        "ExifImageHeight": width * 3 // 4,
-    } | tags
+    tags = {"FocalLength": IFDRational(8 if tags else 50), "ExifImageWidth": width} | tags
+    tags["ExifImageHeight"] = width * 3 // 4
     exif.get_ifd(ExifTags.IFD.Exif).update({getattr(ExifTags.Base, name): value for name, value in tags.items()})
     photo(tmp_path / "a.jpg", (160, 120), exif=exif.tobytes())
     database = tmp_path / "database.db"

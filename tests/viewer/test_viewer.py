@@ -29,7 +29,6 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.data.datamanager import NrfgsInputDataset
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
-from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.model.renderer import View
 from nrfgs_ns.viewer import pictures as drawn
@@ -44,8 +43,7 @@ FIELD = ["residual", "low branch", "high branch", "gate weight", "opacity residu
 
 @pytest.fixture(scope="module")
 def build(tiny_scene, tmp_path_factory):
-    """Pipeline of a method whose head has learnt something: random output layers and latents, or harmonics; and
-    opacities at which a pixel shows few splats."""
+    """Pipeline of a method whose head has learnt something, and with opacities at which a pixel shows few splats."""
 
     def pipeline(method="nrfgs", *options):
         out = tmp_path_factory.mktemp("out")
@@ -78,19 +76,17 @@ def scene(build):
     return pipeline.model, *two_cameras(pipeline)
 
 
-def test_a_head_offers_what_it_has():
-    def offered(config):
-        head = config.setup()
-        splats = {"means": torch.zeros(4, 3), "opacities": torch.zeros(4, 1), **head.splat_params(torch.zeros(4, 3))}
-        modes = list(legends(Field(head, splats)))
-        assert (modes[0], modes[1], modes[-2], modes[-1]) == (FULL, BASE, VIEW_DEPENDENCE, DEPTH)
-        return modes[2:-2]
-
-    assert offered(NrfConfig()) == FIELD
-    assert offered(NrfConfig(split_bands=False)) == ["residual", "opacity residual"]
-    assert offered(NrfConfig(num_bands=1)) == ["residual", "opacity residual"]
-    assert offered(NrfConfig(opacity_residual=False)) == FIELD[:-1]
-    assert offered(ShConfig()) == ["residual"]
+@pytest.mark.parametrize("config, offered", [
+    (NrfConfig(), FIELD),
+    (NrfConfig(split_bands=False), ["residual", "opacity residual"]),
+    (NrfConfig(num_bands=1), ["residual", "opacity residual"]),
+    (NrfConfig(opacity_residual=False), FIELD[:-1]),
+    (ShConfig(), ["residual"]),
+])  # fmt: skip
+def test_a_head_offers_what_it_has(config, offered):
+    head = config.setup()
+    splats = {"means": torch.zeros(4, 3), "opacities": torch.zeros(4, 1), **head.splat_params(torch.zeros(4, 3))}
+    assert list(legends(Field(head, splats))) == [FULL, BASE, *offered, VIEW_DEPENDENCE, DEPTH]
 
 
 @pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh", "nrfgs-vdgs", "nrfgs-gsnb", "nrfgs-sg"])
@@ -116,9 +112,8 @@ def test_gain_leads_from_the_base_to_the_trained_image_and_beyond(scene):
     assert torch.equal(picture(model, camera, PictureOptions(gain=1.0))["rgb"], model.get_outputs(camera)["rgb"])
     view = model.project(camera)
     base, trained = model.field.base_of(view), model.field.seen_from(view)
-    doubled = SplatAppearance(
-        (2 * trained.colors - base.colors).clamp_min(0), (2 * trained.opacities - base.opacities).clamp(0, 1)
-    )
+    colors, opacities = 2 * trained.colors - base.colors, 2 * trained.opacities - base.opacities
+    doubled = SplatAppearance(colors.clamp_min(0), opacities.clamp(0, 1))
     # The same to rounding: 2^-24 in each of at most 300 splats that a pixel adds up.
     by_hand = model.composite(view, doubled)[0]["rgb"]
     assert_close(picture(model, camera, PictureOptions(gain=2.0))["rgb"], by_hand, rtol=0, atol=300 * 2**-24)
@@ -139,9 +134,8 @@ def test_frozen_view_is_the_head_seen_from_elsewhere(scene):
     model, here, there = scene
     center = model.project(there).center
     view = model.project(here)
-    expected = model.composite(view, model.field.seen_from(view._replace(center=center)))[0]["rgb"]
     frozen = picture(model, here, PictureOptions(frozen_center=center))["rgb"]
-    assert torch.equal(frozen, expected)
+    assert torch.equal(frozen, model.composite(view, model.field.seen_from(view._replace(center=center)))[0]["rgb"])
     unfrozen = picture(model, here, PictureOptions())["rgb"]
     assert (frozen - unfrozen).abs().mean() > 1 / 255
     assert torch.equal(picture(model, here, PictureOptions(frozen_center=view.center))["rgb"], unfrozen)
@@ -211,7 +205,6 @@ class Browser(RenderStateMachine):
     @classmethod
     def sees(cls, viewer, pose) -> dict[str, torch.Tensor]:
         thread = cls(viewer, pose)
-        thread.daemon = True
         thread.start()
         thread.join(timeout=300)
         return thread.outputs
@@ -310,10 +303,9 @@ STEPS = 18
 
 def watched_training(scene, out, each_step) -> dict:
     """Train for STEPS and call each_step(trainer) after each; the last checkpoint."""
+    rules = "warmup_length=2,refine_every=4,reset_alpha_every=100,densify_grad_thresh=1e-6"
     options = {
-        "--pipeline.model.densification": Splatfacto(
-            warmup_length=2, refine_every=4, reset_alpha_every=100, densify_grad_thresh=1e-6
-        ),
+        "--pipeline.model.densification": f"splatfacto,{rules}",
         "--pipeline.model.resolution-schedule": 9,
         "--pipeline.model.num-downscales": 1,
         "--pipeline.model.few-views": "off",
@@ -356,10 +348,9 @@ def test_a_training_does_not_notice_who_watches(tiny_scene, tmp_path, open_viewe
 def test_an_interrupted_rendering_leaves_no_lock_behind(build, open_viewer):
     """Nerfstudio interrupts one by an exception at any line, and viser keeps its lock where that is one of its own."""
     pipeline = build()
-    viewer = open_viewer(pipeline)
+    lock = open_viewer(pipeline).viser_server._websock_server._atomic_lock
     panel, camera = pipeline.model.viewer_panel, pipeline.datamanager.eval_dataset.cameras[:1]
     panel.count.value = "?"
-    lock = viewer.viser_server._websock_server._atomic_lock
 
     def interrupt(frame, event, _):
         if frame.f_code.co_filename == _infra.__file__ and lock.locked():
@@ -394,30 +385,23 @@ def test_a_training_s_photographs_are_not_read_again(pipeline, tiny_scene, tmp_p
         viewer.viser_server.stop()
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    config = SceneConfig(views=3, width=640, height=400, points=50, samples=1)
-    scene = write_scene(config, tmp_path_factory.mktemp("large"))
-    return NrfgsInputDataset(NrfgsDataParserConfig(data=scene).setup().get_dataparser_outputs("train"))
-
-
-@pytest.mark.parametrize("read", [True, False], ids=["read", "in files"])
-def test_large_photographs_come_small(dataset, read):
-    images = [dataset.get_data(index, image_type="uint8") for index in range(len(dataset))] if read else None
-    small = start.SmallPhotographs(dataset, images)
-    assert len(small) == len(dataset) and small.cameras is dataset.cameras
-    image = small[0]["image"]
-    assert min(image.shape[:2]) in range(start.SIDE, 2 * start.SIDE) and image.shape[2] == 3
-    whole = dataset.get_data(0)["image"].permute(2, 0, 1)[None]
-    shape = tuple(image.shape[:2])
-    expected = torch.nn.functional.interpolate(whole, shape, mode="area")[0].permute(1, 2, 0)
-    assert (image - expected).abs().mean() < 0.03
+def test_large_photographs_come_small(tmp_path):
+    scene = write_scene(SceneConfig(views=3, width=640, height=400, points=50, samples=1), tmp_path / "large")
+    dataset = NrfgsInputDataset(NrfgsDataParserConfig(data=scene).setup().get_dataparser_outputs("train"))
+    read = [dataset.get_data(index, image_type="uint8") for index in range(len(dataset))]
+    for images in (read, None):  # in memory, or in files
+        small = start.SmallPhotographs(dataset, images)
+        assert len(small) == len(dataset) and small.cameras is dataset.cameras
+        image = small[0]["image"]
+        assert min(image.shape[:2]) in range(start.SIDE, 2 * start.SIDE) and image.shape[2] == 3
+        whole = dataset.get_data(0)["image"].permute(2, 0, 1)[None]
+        expected = torch.nn.functional.interpolate(whole, tuple(image.shape[:2]), mode="area")[0].permute(1, 2, 0)
+        assert (image - expected).abs().mean() < 0.03
 
 
 @pytest.mark.parametrize("mode", ["L", "RGBA", "P", "CMYK"])
 def test_a_photograph_of_any_mode_is_shown_in_colour(tmp_path, mode):
     path = tmp_path / ("a.jpg" if mode == "CMYK" else "a.png")
     Image.fromarray(np.full((30, 40, 3), 153, np.uint8)).convert(mode).save(path)
-    dataset = type("", (), {"cameras": None, "image_filenames": [path]})()
-    image = start.SmallPhotographs(dataset, None)[0]["image"]
+    image = start.SmallPhotographs(SimpleNamespace(cameras=None, image_filenames=[path]), None)[0]["image"]
     assert image.shape == (30, 40, 3) and (image - 153 / 255).abs().max() < 0.02

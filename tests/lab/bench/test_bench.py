@@ -119,10 +119,8 @@ def test_failures_are_listed_and_tried_again(fake):
 
 def test_parts_of_a_file_report_all_that_is_there(fake):
     """Runs, seeds and scenes of the same file, asked for one after the other."""
-    text = (
-        "runs: {no split: {method: nrfgs, options: --x 1}, SH: nrfgs-sh, NRF: nrfgs}\n"
-        "scenes: [scene, {path: other, downscale: 2}]\nseeds: [1, 2]\nsteps: 100\n"
-    )
+    text = FILE.replace("runs: {", "runs: {no split: {method: nrfgs, options: --x 1}, ")
+    text = text.replace("[scene]", "[scene, {path: other, downscale: 2}]")
 
     def rows(**chosen) -> list[list[str]]:
         bench_in(fake, text, **chosen).main()
@@ -134,8 +132,7 @@ def test_parts_of_a_file_report_all_that_is_there(fake):
     assert rows(runs=("no split",), data=("./scene/",), seeds=(2,)) == both
     assert rows(runs=("NRF",), data=("other",), seeds=(1,)) == [*both, ["other", "NRF", [1]]]
     assert len(ran(fake)) == 3
-    record = json.loads((fake / "out" / "runs" / "NRF-own-other-1.json").read_text())
-    parser = record["identity"]["parser"]
+    parser = json.loads((fake / "out" / "runs" / "NRF-own-other-1.json").read_text())["identity"]["parser"]
     assert parser[0] == "nrfgs-data" and parser[-2:] == ["--downscale-factor", "2"], "read as the file says"
 
 
@@ -163,9 +160,8 @@ def test_a_stopped_benchmark_takes_its_children_along(stop, status, fake, monkey
 
 def test_records_of_other_arguments_are_refused_named_and_redone(fake, capsys):
     bench_in(fake, seeds=(1,)).main()
-    with pytest.raises(
-        InputError, match="2 of the records.*SH-own-scene-1 had options: --max-num-iterations 100.*--redo-stale"
-    ):
+    said = "2 of the records.*SH-own-scene-1 had options: --max-num-iterations 100.*--redo-stale"
+    with pytest.raises(InputError, match=said):
         bench_in(fake, seeds=(1,), steps=50).main()
     assert len(ran(fake)) == 2
     (fake / "data" / "scene" / "transforms.json").rename(fake / "elsewhere")  # a report needs no data
@@ -206,9 +202,8 @@ def test_a_plan_with_knobs_reports_the_trade(fake):
     knobs = "default: nrfgs\nscenes: [scene]\nseeds: [1, 2]\nsteps: 100\n"
     knobs += "knobs: {D: {option: --d, values: [4, 8]}, head: {settings: {SH: nrfgs-sh}}, steps: {steps: [50]}}\n"
     bench_in(fake, knobs, runs=("D 8", "head")).main()
-    assert {name for name, _ in ran(fake)} == {
-        f"{run}-own-scene-{seed}" for run in ("default", "D_8", "head_SH") for seed in (1, 2)
-    }
+    runs = ("default", "D_8", "head_SH")
+    assert {name for name, _ in ran(fake)} == {f"{run}-own-scene-{seed}" for run in runs for seed in (1, 2)}
     text = (fake / "out" / "tradeoff.md").read_text()
     assert re.findall(r"^\| ([*\w ]+) \| 2 \|", text, re.MULTILINE) == ["**default**", "D 8", "head SH"]
     assert (fake / "out" / "tradeoff.png").exists() and "| D 8 | 2 | (+0.00)" in text

@@ -17,13 +17,12 @@ PSNR = BY_NAME["PSNR"]
 
 
 def record(psnr, ssim=0.9, lpips=None, train=None, seconds=10.0, jobs=1, splats=1000, parts=1, device="a card"):
-    test = {"psnr": psnr, "ssim": ssim, "ms_ssim": None, "l1": 0.01, "lpips": lpips}
     return {
         "machine": {"device": device, "torch": "2.11"},
         "jobs": jobs,
         "train": {"seconds": seconds, "parts": parts, "splats": [[0, 100], [100, splats]]},
         "measured": {
-            "test": test,
+            "test": {"psnr": psnr, "ssim": ssim, "ms_ssim": None, "l1": 0.01, "lpips": lpips},
             "train": None if train is None else {"psnr": train},
             "fps": 50.0,
             "splats": splats,
@@ -116,8 +115,7 @@ def row(name, *records):
 
 
 def test_differences_inside_the_noise_are_marked():
-    """One deviation for all: pairs 0.2 apart have s = 0.1414, 3 degrees of freedom, so the bound is
-    t(3) 0.1414 = 3.182 * 0.1414 = 0.450."""
+    """One deviation for all: pairs 0.2 apart have s = 0.1414, 3 degrees of freedom; t(3) s = 3.182 * 0.1414 = 0.450."""
     rows = [
         row("default", record(30.0), record(30.2)),
         row("near", record(30.4), record(30.6)),

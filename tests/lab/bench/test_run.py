@@ -4,6 +4,7 @@
 import json
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -18,32 +19,15 @@ from nrfgs_lab.training_run import TrainRecord
 from nrfgs_ns.files import write_whole
 
 
-def job_in(folder: Path, method="nrfgs", steps=100) -> Job:
-    args = [method, "--output-dir", str(folder), "--max-num-iterations", str(steps), "nrfgs-data", "--data", "x"]
-    return Job(args, {}, {"options": args[:1]}, steps, str(folder / "record.json"), str(folder), 0, 1)
-
-
 def interrupted(folder: Path, *checkpoints: int, reached: int) -> None:
     """The work folder of a training that was killed after step `reached`."""
     models = folder / "scene" / "nrfgs" / "2000-01-01" / "nerfstudio_models"
     models.mkdir(parents=True)
     for step in checkpoints:
         (models / f"step-{step:09d}.ckpt").write_bytes(b"")
-    splats = [[step, 10 + step] for step in range(0, reached + 1, 10)]
-    record = TrainRecord(
-        ["nrfgs"], "lost", steps=reached + 1, seconds=99.0, splats=splats, saved=[[20, 2.0], [40, 4.0]]
-    )
+    splats, saved = [[step, 10 + step] for step in range(0, reached + 1, 10)], [[20, 2.0], [40, 4.0]]
+    record = TrainRecord(["nrfgs"], "lost", steps=reached + 1, seconds=99.0, splats=splats, saved=saved)
     write_whole(folder / "train.json", json.dumps(record.__dict__))
-
-
-@pytest.fixture
-def trained(monkeypatch):
-    """Calls of a train() that does nothing."""
-    calls = []
-    monkeypatch.setattr(
-        bench_run, "train", lambda args, on_save, earlier: calls.append((args, earlier)) or TrainRecord(args, "")
-    )
-    return calls
 
 
 def test_the_record_fits_the_checkpoint_that_is_there(tmp_path):
@@ -58,12 +42,16 @@ def test_the_record_fits_the_checkpoint_that_is_there(tmp_path):
     "method, steps, checkpoints",
     [("nrfgs", 100, []), ("splatfacto", 100, [20, 40]), ("nrfgs", 100, [33]), ("nrfgs", None, [20])],
 )
-def test_what_cannot_be_continued_starts_anew(method, steps, checkpoints, tmp_path, trained):
+def test_what_cannot_be_continued_starts_anew(method, steps, checkpoints, tmp_path, monkeypatch):
     """No checkpoint; a method that cannot resume; a checkpoint without a note; steps that the method chooses."""
+    train = Mock(return_value=TrainRecord([], ""))
+    monkeypatch.setattr(bench_run, "train", train)
     interrupted(tmp_path, *checkpoints, reached=60)
-    job = job_in(tmp_path, method, steps)
+    args = [method, "--output-dir", str(tmp_path), "--max-num-iterations", str(steps), "nrfgs-data", "--data", "x"]
+    job = Job(args, {}, {"options": args[:1]}, steps, str(tmp_path / "record.json"), str(tmp_path), 0, 1)
     train_or_continue(job, tmp_path)
-    assert trained == [(job.args, None)]
+    (call,) = train.mock_calls
+    assert call.args == (args,) and call.kwargs["earlier"] is None
 
 
 def test_checkpoints_of_other_arguments_are_cleared(tmp_path):

@@ -73,10 +73,7 @@ def test_which_trainings_a_plan_has():
     ({"options": "--machine.seed=3"}, "options: --machine.seed is given by the benchmark; use seeds"),
     ({"strategies": []}, "strategies or seeds is empty"),
     ({"scenes": ["../bonsai"]}, "no folder below --scenes"),
-    (
-        {"strategies": ["mcmc"], "options": "--pipeline.model.densification original"},
-        "densification is given.*mcmc",
-    ),
+    ({"strategies": ["mcmc"], "options": "--pipeline.model.densification original"}, "densification is given.*mcmc"),
 ])  # fmt: skip
 def test_what_is_wrong_is_named(content, says):
     with pytest.raises(InputError, match=says):
@@ -96,8 +93,7 @@ def test_a_preset_keeps_its_steps():
     plan = spec(runs=runs, steps=30_000)
     assert [steps_of(plan, run, plan.scenes[0]) for run in plan.runs] == [10_000, 77, 30_000]
     own = {one.config.method_name: one.config.max_num_iterations for one in methods()}
-    chosen = {own.pop("nrfgs"), own.pop("nrfgs-harmonics")}
-    assert chosen == {0}, "by the number of views; a benchmark says it"
+    assert own.pop("nrfgs") == own.pop("nrfgs-harmonics") == 0, "by the number of views; a benchmark says it"
     assert PRESET_STEPS == {name: steps for name, steps in own.items() if steps != 30_000}
 
 
@@ -107,11 +103,9 @@ def test_a_preset_keeps_its_steps():
 )
 def test_the_command_means_what_the_file_says(strategy, densification, tiny_scene, tmp_path):
     runs = {"NRF": {"method": "nrfgs", "options": "--pipeline.model.appearance.latent-dim 9"}}
-    more = "--pipeline.model.num-downscales 0"
-    plan = spec(runs=runs, strategies=[strategy], steps=7, seeds=[5], options=more)
-    (cell,) = cells_of(plan)
+    plan = spec(runs=runs, strategies=[strategy], steps=7, seeds=[5], options="--pipeline.model.num-downscales 0")
     parser = parser_options(tiny_scene.parent, Scene(tiny_scene.name), tmp_path)
-    config = parse(command(plan, cell, parser, tmp_path))
+    config = parse(command(plan, *cells_of(plan), parser, tmp_path))
     model = config.pipeline.model
     assert model.densification == densification
     assert (config.max_num_iterations, config.machine.seed, model.num_downscales) == (7, 5, 0)
@@ -176,14 +170,12 @@ def test_a_data_set_of_the_same_name_elsewhere_is_read_there(tmp_path):
         parser = parser_options(tmp_path / place, Scene("line"), tmp_path / "mirrors")
         mirror = Path(parser[parser.index("--data") + 1])
         assert (mirror / "images").resolve() == (tmp_path / place / "line" / "images").resolve()
-    assert sorted(entry.name for entry in mirror.iterdir()) == [
-        *("colmap", "images", "test_list.txt", "train_list.txt", "val_list.txt")
-    ]
+    lists = {"test_list.txt", "train_list.txt", "val_list.txt"}
+    assert {entry.name for entry in mirror.iterdir()} == {"colmap", "images", *lists}
 
 
 def test_nerfstudios_layout_without_a_split_has_every_8th_by_name(tiny_scene, tmp_path):
-    shutil.copytree(tiny_scene, tmp_path / "plain")
-    file = tmp_path / "plain" / "transforms.json"
+    file = shutil.copytree(tiny_scene, tmp_path / "plain") / "transforms.json"
     meta = {key: value for key, value in json.loads(file.read_text()).items() if not key.endswith("_filenames")}
     file.write_text(json.dumps({**meta, "frames": meta["frames"][::-1]}))
     data = load(parser_options(tmp_path, Scene("plain"), tmp_path / "mirrors"))
@@ -201,8 +193,7 @@ def test_held_out_scenes_have_no_test_view_and_the_same_cameras_at_half_the_size
     whole = json.loads((tiny_scene / "transforms.json").read_text())
     names = sorted(frame["file_path"] for frame in whole["frames"])
     whole |= {"train_filenames": names[1:], "test_filenames": names[:1]}
-    source = tmp_path / "captures" / "tiny"
-    shutil.copytree(tiny_scene, source)
+    source = shutil.copytree(tiny_scene, tmp_path / "captures" / "tiny")
     (source / "transforms.json").write_text(json.dumps(whole))
     plan = spec(scenes=["tiny", {"path": "tiny", "views": 2}], held_out=[2])
     assert [scene.name for scene in plan.scenes] == ["2/tiny", "2/2/tiny"]
@@ -224,10 +215,8 @@ def test_held_out_scenes_have_no_test_view_and_the_same_cameras_at_half_the_size
     (fold,) = spec(scenes=["tiny"], held_out=[1], held_out_every=3).scenes
     assert fold.name == "1 of 3/tiny"
     assert made(fold)[1]["test_filenames"] == names[1:][1::3]
-    blocks = [
-        made(scene)[1] for scene in spec(scenes=["tiny"], held_out=[0, 1], held_out_every=2, held_out_by="place").scenes
-    ]
-    first, second = (set(block["test_filenames"]) for block in blocks)
+    blocks = spec(scenes=["tiny"], held_out=[0, 1], held_out_every=2, held_out_by="place").scenes
+    first, second = (set(made(block)[1]["test_filenames"]) for block in blocks)
     assert first | second == set(names[1:]) and not first & second
     places = {frame["file_path"]: np.array(frame["transform_matrix"])[:3, 3] for frame in whole["frames"]}
     axis = np.linalg.svd(np.array(some := [places[name] for name in names[1:]]) - np.mean(some, axis=0))[2][0]
@@ -244,8 +233,7 @@ def test_held_out_scenes_have_no_test_view_and_the_same_cameras_at_half_the_size
 @pytest.mark.parametrize("views", [None, 4])
 def test_smaller_images_are_there_for_methods_that_only_read_them(views, tiny_scene, tmp_path):
     """Equal to those that `nrfgs-data` resizes itself, of any mode, with masks and EXIF; broken-off work goes on."""
-    source = tmp_path / "captures" / "tiny"
-    shutil.copytree(tiny_scene, source)
+    source = shutil.copytree(tiny_scene, tmp_path / "captures" / "tiny")
     meta = json.loads((source / "transforms.json").read_text())
     names = sorted(frame["file_path"] for frame in meta["frames"])
     meta |= {"train_filenames": names[1:], "test_filenames": names[:1]}

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from plyfile import PlyData
 from torch.testing import assert_close
 
 from nrfgs_lab.nerfbaselines.method import Nrfgs, NrfgsFast, World
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
+from nrfgs_ns.data.points import read_ply
 
 STEPS = 6
 OPTIONS = {"max_num_iterations": 50, "pipeline.model.num_downscales": 0, "logging.steps_per_log": 2}
@@ -40,20 +40,19 @@ def read(scene: Path, split: str | None = None) -> dict:
     meta = json.loads((scene / "transforms.json").read_text())
     frames = [frame for frame in meta["frames"] if split is None or frame["file_path"] in meta[f"{split}_filenames"]]
     poses = np.array([frame["transform_matrix"] for frame in frames], dtype=np.float32)[:, :3]
-    intrinsics = [[meta["fl_x"], meta["fl_y"], meta["cx"], meta["cy"]]] * len(frames)
-    vertices = PlyData.read(scene / "sparse.ply")["vertex"]
+    xyz, rgb = read_ply(scene / "sparse.ply")
     return {
         "cameras": GivenCameras(
             poses * np.array([1, -1, -1, 1], dtype=np.float32),
-            np.array(intrinsics, dtype=np.float32),
+            np.array([[meta["fl_x"], meta["fl_y"], meta["cx"], meta["cy"]]] * len(frames), dtype=np.float32),
             np.zeros(len(frames), dtype=np.int32),
             np.array([[meta["w"], meta["h"]]] * len(frames), dtype=np.int32),
         ),
         "image_paths": [str(scene / frame["file_path"]) for frame in frames],
         "images": [np.array(Image.open(scene / frame["file_path"])) for frame in frames],
         "masks": None,
-        "points3D_xyz": np.stack([vertices[axis] for axis in "xyz"], axis=-1),
-        "points3D_rgb": np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=-1),
+        "points3D_xyz": xyz,
+        "points3D_rgb": rgb,
         "metadata": {"color_space": "srgb", "evaluation_protocol": "default"},
     }
 
@@ -61,17 +60,6 @@ def read(scene: Path, split: str | None = None) -> dict:
 def train(method: Nrfgs, first: int, last: int) -> None:
     for step in range(first, last):
         method.train_iteration(step)
-
-
-@pytest.fixture(scope="module")
-def trained(tiny_scene, tmp_path_factory):
-    """A method after a few steps, and its checkpoint."""
-    method = Nrfgs(train_dataset=read(tiny_scene, "train"), config_overrides=OPTIONS)
-    train(method, 0, STEPS)
-    folder = tmp_path_factory.mktemp("checkpoint") / "first"
-    method.save(str(folder))
-    yield method, folder
-    method.close()
 
 
 def test_cameras_and_points_are_where_nerfstudio_has_them(tiny_scene):
@@ -89,8 +77,10 @@ def test_cameras_and_points_are_where_nerfstudio_has_them(tiny_scene):
     assert_close(points, train.metadata["points3D_xyz"], rtol=0, atol=1e-6)
 
 
-def test_a_checkpoint_renders_without_the_images(trained, tiny_scene, tmp_path):
-    method, folder = trained
+def test_a_checkpoint_renders_without_the_images(tiny_scene, tmp_path):
+    method, folder = Nrfgs(train_dataset=read(tiny_scene, "train"), config_overrides=OPTIONS), tmp_path / "first"
+    train(method, 0, STEPS)
+    method.save(str(folder))
     loaded = Nrfgs(checkpoint=str(folder))
     assert loaded.get_info()["loaded_step"] == STEPS
     for split in ("train", "test"):
@@ -111,6 +101,7 @@ def test_a_checkpoint_renders_without_the_images(trained, tiny_scene, tmp_path):
     assert one.name == other.name and one.read_bytes() == other.read_bytes()
     loaded.save(str(folder))  # where it came from
     assert one.read_bytes() == other.read_bytes()
+    method.close()
 
 
 def test_a_training_goes_on_as_if_it_had_not_stopped(tiny_scene, tmp_path):

@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the pages say holds: the worked example of docs/contributing.md, the options' tables, the commands."""
+"""What the pages say holds: numbers, links, options, commands, and the worked example of docs/contributing.md."""
 
 import contextlib
 import dataclasses
-import importlib.util
 import io
 import json
 import re
 import shlex
-import sys
 from pathlib import Path
 
 import pytest
@@ -17,45 +15,115 @@ import tyro
 from nerfstudio.configs import method_configs
 from nerfstudio.plugins.registry import discover_methods
 from nerfstudio.utils import eval_utils
-from short_trainings import recorded
+from short_trainings import command_line, recorded
 
+from nrfgs_lab.pages import site, tables
+from nrfgs_lab.pages.figures import FIGURES
 from nrfgs_lab.pages.options import PAGE, explanation, methods, own_options, page
-from nrfgs_lab.pages.tables import pages
+from nrfgs_lab.pages.tables import BLOCK, BLOCKS, ROOT, SHEET, declared, pages, written
 from nrfgs_lab.training_run import evaluate, parse, train
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.cli import commands
+from nrfgs_ns.training.identity import leaves
 
-CONTRIBUTING = Path(__file__).resolve().parents[3] / "docs" / "contributing.md"
+PAGES = {str(page.relative_to(ROOT)): page.read_text(encoding="utf-8") for page in pages()}
+LINK = re.compile(r"\]\(([^)\s]+)\)")
 
 
-@pytest.fixture
-def my_head(tmp_path, monkeypatch):
-    """The page's module, on the path under its own name."""
-    (code,) = re.findall(r"```python\n(# my_head\.py\n.*?)```", CONTRIBUTING.read_text(), re.DOTALL)
+@pytest.mark.parametrize("name", PAGES)
+def test_numbers_are_those_of_the_records(name):
+    assert PAGES[name] == written(PAGES[name]), "write them again: python -m nrfgs_lab.pages.tables --write"
+
+
+@pytest.mark.parametrize("name", [name for name, text in PAGES.items() if BLOCK.search(text)])
+def test_decibels_in_prose_stand_in_a_block_of_the_page(name):
+    inside = " ".join(content for *_, content in BLOCK.findall(PAGES[name]))
+    prose = re.sub(r"```.*?```|`[^`\n]*`", "", BLOCK.sub("", PAGES[name]), flags=re.DOTALL)
+    loose = set(re.findall(r"(?<![\d.])(\d+(?:\.\d+)?) dB", prose))
+    assert not loose - set(re.findall(r"\d+(?:\.\d+)?", inside))
+
+
+def anchors(text: str) -> set[str]:
+    """The anchors of a page's headings, as GitHub makes them."""
+    titles = re.findall(r"^#+ (.*)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.strip().lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_links_lead_to_files_and_headings_that_are_there(name):
+    page = ROOT / name
+    for link in LINK.findall(re.sub(r"```.*?```", "", PAGES[name], flags=re.DOTALL)):
+        path, _, anchor = link.partition("#")
+        if "://" in link:
+            continue
+        target = (page.parent / path).resolve() if path else page
+        assert target.exists(), link
+        assert target.is_relative_to(ROOT), f"{link} leads out of the repository"
+        if anchor:
+            assert anchor in anchors(target.read_text(encoding="utf-8")), link
+
+
+def test_the_site_has_every_page_and_no_link_out_of_it():
+    nav = re.findall(r"[\w-]+\.md", (ROOT / "mkdocs.yml").read_text().partition("nav:")[2])
+    assert sorted(nav) == sorted(["index.md", *(path.name for path in (ROOT / "docs").glob("*.md"))])
+    for text in PAGES.values():
+        assert not re.search(r"\]\(\.\./", site.on_page_markdown(text))
+
+
+def test_a_number_that_is_not_the_record_s_is_noticed():
+    text = next(text for text in PAGES.values() if BLOCK.search(text))
+    first = BLOCK.search(text)
+    changed = text[: first.start(3)] + re.sub(r"\d", "7", first[3]) + text[first.end(3) :]
+    assert changed != text and written(changed) == text
+
+
+def test_every_block_and_picture_is_on_a_page():
+    used = {match[1] + (match[2] or "") for text in PAGES.values() for match in BLOCK.finditer(text)}
+    assert set(declared()) <= used
+    assert set(BLOCKS) <= {name.partition("(")[0] for name in used}
+    shown = {Path(link).name for text in PAGES.values() for link in LINK.findall(text)}
+    assert {path.name for path in (ROOT / "docs" / "images").iterdir()} <= shown
+
+
+def test_every_record_is_shown_or_used():
+    """By a block, by a page that names the file, or by a test."""
+    sources = [SHEET, *Path(tables.__file__).parent.glob("*.py"), *(ROOT / "tests").rglob("*.py")]
+    text = "\n".join([*PAGES.values(), *(path.read_text(encoding="utf-8") for path in sources)])
+    used = set(re.findall(r"""["']([\w-]+)["']|results/([\w-]+)\.json|[{ ]([\w-]+)\|""", text))
+    assert {path.stem for path in (ROOT / "results").glob("*.json")} <= {stem for names in used for stem in names}
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_files_that_a_page_names_are_there(name):
+    paths = re.findall(
+        r"(?<![\w/])(?:nrfgs_ns|nrfgs_lab|tests|results|docs)/[\w/.-]*\.(?:py|md|json|yaml)\b", PAGES[name]
+    )
+    paths = [path for path in paths if "NAME" not in path]
+    paths += [name.replace(".", "/") for name in re.findall(r"python -m (nrfgs_(?:ns|lab)[\w.]*)", PAGES[name])]
+    assert [path for path in paths if not any((ROOT / f"{path}{end}").exists() for end in ("", ".py"))] == []
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_a_figure_is_that_of_the_records(name):
+    assert FIGURES[name]() == (ROOT / "docs" / "images" / name).read_text(encoding="utf-8")
+
+
+def test_it_trains_under_the_name_that_the_page_gives_it(tiny_scene, tmp_path, monkeypatch):
+    (code,) = re.findall(r"```python\n(# my_head\.py\n.*?)```", PAGES["docs/contributing.md"], re.DOTALL)
     (tmp_path / "my_head.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))
-    spec = importlib.util.spec_from_file_location("my_head", tmp_path / "my_head.py")
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "my_head", module)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_it_trains_under_the_name_that_the_page_gives_it(my_head, tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setenv("NERFSTUDIO_METHOD_CONFIGS", "linear=my_head:linear")
     configs, descriptions = discover_methods()
     assert descriptions["linear"] == "Colours that are linear in the view direction."
     # nerfstudio looks for methods when it is first imported; here it was imported long ago.
     monkeypatch.setitem(eval_utils.all_methods, "linear", configs["linear"])
     monkeypatch.setattr(method_configs, "AnnotatedBaseConfigUnion", tyro.extras.subcommand_type_from_defaults(configs))
-    args = ["linear", "--data", str(tiny_scene), "--output-dir", str(tmp_path), "--max-num-iterations", "25"]
-    args += ["--vis", "tensorboard", "--pipeline.model.densification", "splatfacto,warmup_length=5,refine_every=10"]
-    args += ["--steps-per-eval-image", "1000", "--steps-per-eval-all-images", "1000"]
-    record = train([*args, "--pipeline.model.num-downscales", "0"])
+    refining = {"--pipeline.model.densification": "splatfacto,warmup_length=5,refine_every=10"}
+    plain = {"--pipeline.model.num-downscales": 0, "--logging.local-writer.enable": None}  # a flag here
+    record = train(command_line("linear", tiny_scene, tmp_path, 25, refining, plain))
     state = torch.load(next(tmp_path.rglob("*.ckpt")), weights_only=True)["pipeline"]
     assert state["_model.gauss_params.slopes"].abs().max() > 0
-    reached = evaluate(record.config_path, tmp_path / "eval.json")["psnr"]
-    assert reached > recorded()["tiny/nrfgs-sh"]["after_one_step"]
+    assert evaluate(record.config_path, tmp_path / "eval.json")["psnr"] > recorded()["tiny/nrfgs-sh"]["after_one_step"]
 
 
 def test_the_page_of_options_is_current_and_explains_each():
@@ -74,51 +142,28 @@ def test_the_page_of_options_is_current_and_explains_each():
     assert not any("sh-degree" in flag or "num-downscales" in flag for flag in flags)  # suppressed; splatfacto's
 
 
-ROOT = Path(__file__).resolve().parents[3]
-DOCS = ROOT / "docs"
-
-
 def test_the_page_has_the_commands_that_were_run():
-    page = (DOCS / "own-data.md").read_text(encoding="utf-8")
-    shown = " ".join(re.sub(r" +#.*", "", page).replace("\\\n", " ").split())
+    shown = " ".join(re.sub(r" +#.*", "", PAGES["docs/own-data.md"]).replace("\\\n", " ").split())
     record = json.loads((ROOT / "results" / "prepare.json").read_text(encoding="utf-8"))["records"]["newcomer"]
     assert [step["step"] for step in record["commands"]] == ["prepare", "train", "look", "eval", "export"]
     for step in record["commands"]:
         assert re.sub(r"\d{4}-\d\d-\d\d_\d{6}", "DATE", step["command"]) in shown
 
 
-def flags(config, prefix: str = "") -> set[str]:
-    """Every option of a configuration and of those inside it, and what they are inside of."""
-    found = set()
-    for field in dataclasses.fields(config):
-        name, value = prefix + field.name.replace("_", "-"), getattr(config, field.name)
-        found.add(name)
-        if dataclasses.is_dataclass(value) and not isinstance(value, type):
-            found |= flags(value, f"{name}.")
-    return found
-
-
 def test_options_that_pages_name_are_there():
-    known = set().union(*(flags(method.config) for method in methods()))
-    shown = {
-        flag for path in pages() for flag in re.findall(r"--(pipeline\.[\w.-]*\w)", path.read_text(encoding="utf-8"))
-    }
+    known = {name.replace("_", "-") for method in methods() for name, _ in leaves(method.config)}
+    shown = {flag.replace("_", "-") for text in PAGES.values() for flag in re.findall(r"--(pipeline\.[\w.-]*\w)", text)}
     assert len(shown) > 10
-    assert {flag.replace("_", "-") for flag in shown} <= known
-
-
-def commands_shown() -> list[str]:
-    """The commands of this package in the pages' shell lines, without comments and variables before them."""
-    found = []
-    for path in pages():
-        for fence in re.findall(r"```bash\n(.*?)```", path.read_text(encoding="utf-8"), re.DOTALL):
-            lines = re.sub(r"\s#.*", "", fence.replace("\\\n", " "))
-            found += re.findall(r"(?:^|&& )(?:[A-Z_]+=\S+ )?((?:nrfgs|ns-train nrfgs\S*) [^&\n]+)", lines, re.MULTILINE)
-    return sorted({" ".join(line.split()) for line in found})
+    assert [flag for flag in shown if not any(f"{name}.".startswith(f"{flag}.") for name in known)] == []
 
 
 def test_commands_that_pages_show_are_understood():
-    shown = commands_shown()
+    """Those of this package, without comments and variables before them."""
+    shown = set()
+    for fence in re.findall(r"```bash\n(.*?)```", "\n".join(PAGES.values()), re.DOTALL):
+        lines = re.sub(r"\s#.*", "", fence.replace("\\\n", " "))
+        found = re.findall(r"(?:^|&& )(?:[A-Z_]+=\S+ )?((?:nrfgs|ns-train nrfgs\S*) [^&\n]+)", lines, re.MULTILINE)
+        shown |= {" ".join(line.split()) for line in found}
     assert len(shown) > 40
     for line in shown:
         program, first, *rest = shlex.split(line)

@@ -61,7 +61,6 @@ def test_a_bare_step_moves_every_tensor(monkeypatch):
 
 
 # `nrfgs_lab.timing.fits`.
-@pytest.mark.usefixtures("no_cuda")
 def test_trainings_and_parts_are_measured_once(tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(scale, "WARM", 1)
     monkeypatch.setattr(scale, "PROFILED", 1)
