@@ -12,6 +12,7 @@ from nrfgs_lab.pages.runs import (
     grid,
     mean,
     mean_of,
+    records,
     signed,
     trainings,
     view_gains,
@@ -113,6 +114,67 @@ def over_gsnb() -> str:
     return "{:.2f} to {:.2f} dB".format(*(median(view_gains(field, other)) for other in others))
 
 
+# Equal numbers of splats, at half size, in 10,000 steps, one seed.
+
+COUNTS, CURVES = (75_000, 150_000, 300_000), ("bonsai", "goldcape", "caliterra")
+BY_ERROR, FROZEN = "error-guided", "field, its network frozen at random"
+HEADS_OF = {
+    run: (run, BY_ERROR) for run in ("field", "field without opacity residual", "GSNB", "VDGS", "harmonics", FROZEN)
+}
+RULES_OF = {
+    "growth by error (nrfgs)": ("field", BY_ERROR),
+    "splatfacto's rules": ("field", "splatfacto"),
+    "3DGS's rules": ("field", ORIGINAL),
+    "3DGS-MCMC": ("field", "mcmc"),
+}
+SEATS_OF = {run: (run, BY_ERROR) for run in ("field", "harmonics", "network at the pixel", "convolutions at the pixel")}
+"""Label of a line in a figure -> its run and rule."""
+
+
+def equal(scene: str, run: str, count: int = COUNTS[1], rule: str = BY_ERROR) -> Trainings:
+    """A run of the plan `numbers`."""
+    name = "".join(letter if letter.isalnum() else "_" for letter in run)
+    return trainings("numbers", scene, name, f"{rule}@{count}")
+
+
+def at_equal_numbers() -> str:
+    """Harmonics with 150,000 splats, and what the others gain over them, dB and SSIM x 1000."""
+    scenes = *CURVES, "castle"
+    bases = [equal(scene, "harmonics") for scene in scenes]
+    body = [["harmonics", *map(cell, bases)]]
+    for run in ("VDGS", "GSNB", FROZEN, "field without opacity residual", "field without distance", "field"):
+        pairs = [(equal(scene, run), base) for scene, base in zip(scenes, bases, strict=True)]
+        both = [f"{signed(gain(*pair, 'psnr'), 2)}/{signed(1000 * gain(*pair, 'ssim'), 0)}" for pair in pairs]
+        body.append([f"**{run}**" if run == "field" else run, *both])
+    return grid(["", *scenes], body)
+
+
+def seats() -> str:
+    """Quality, cost and flicker of networks at the splat and at the pixel."""
+    names = {"field": "nrfgs", "harmonics": "nrfgs-sh"}
+    names |= {"network at the pixel": "nrfgs-deferred", "convolutions at the pixel": "nrfgs-latent-spec"}
+    costs, body = records("pixel"), []
+    for run, method in names.items():
+        quality = [cell(equal(scene, run)) for scene in (*CURVES, "castle")]
+        small, large = ([costs[f"300000/{size}/{method}/{turn}"] for turn in turns] for size, turns in SIZES.items())
+        frames = "/".join(f"{max(one[size] for one in small):.0f}" for size in ("1080p", "4K"))
+        steps = [f"{median(one['step_ms'] for one in ones):.1f}" for ones in (small, large)]
+        still = costs[f"flicker/{run}/bonsai"]
+        more = [
+            *steps,
+            frames,
+            f"{large[0]['peak_mb'] / 1000:.1f}",
+            f"{still['flicker']:.2f}",
+            f"{still['psnr']['2']:.1f}",
+        ]
+        body.append([f"**{run}**" if run == "field" else run, *quality, *more])
+    columns = "step at 0.4 MP, ms", "at 2 MP", "frames a second, 1080p/4K", "GB at 2 MP", "flicker", "twice the size"
+    return grid(["", *CURVES, "castle", *columns], body)
+
+
+SIZES = {0.4: (0, 1), 2.0: (0,)}
+"""Megapixels of a timed step -> its repeats."""
+
 # The choice of the heads' settings.
 
 TRIALS = {"third": "a third of its rate", "triple": "three times its rate", "shrinkage": "shrinkage"}
@@ -170,6 +232,7 @@ def noise() -> str:
 
 
 BLOCKS = {
-    **{f"comparison.{block.__name__}": block for block in (every, gains, parts, over_gsnb, chosen)},
+    **{f"comparison.{block.__name__}": block for block in (every, gains, parts, over_gsnb, chosen, at_equal_numbers)},
+    "pixel.seats": seats,
     **{f"deviations.{block.__name__}": block for block in (worth, noise)},
 }

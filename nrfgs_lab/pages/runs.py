@@ -18,7 +18,9 @@ from nrfgs_lab.bench.table import BY_NAME, Row
 from nrfgs_lab.bench.table import grid as grid
 
 ROOT = Path(__file__).resolve().parents[2]
-RUN = re.compile(r"runs/(?P<run>.+)-(?P<strategy>own|original|(mcmc|error-guided)@\d+)-(?P<scene>[^-]+)-(?P<seed>\d+)")
+RUN = re.compile(
+    r"runs/(?P<run>.+)-(?P<strategy>own|original|(original|splatfacto|mcmc|error-guided)@\d+)-(?P<scene>[^-]+)-(?P<seed>\d+)"
+)
 """Names of a benchmark's records. An underscore stands for a space."""
 VIEWS = {"bonsai": 255, "goldcape": 74, "caliterra": 65, "fox": 43, "castle": 26, "kitchen": 21, "fern": 17}
 """Capture -> its training views."""
