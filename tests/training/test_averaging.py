@@ -1,19 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mean over a training's last steps: of which steps it is, when it begins anew, and that it resumes to the bit."""
+"""The mean over a training's last steps: of which steps it is, and when it begins anew. test_ending.py resumes it."""
 
 from types import SimpleNamespace
 
 import pytest
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
-from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
+from short_trainings import assert_same_training, checkpoint_of, command_line, set_up, trained
 from torch.testing import assert_close
 
 from nrfgs_ns.densification import relocation
 from nrfgs_ns.densification.rows import take_rows
 from nrfgs_ns.training import averaging
 from nrfgs_ns.training.averaging import ParameterMean, window
-from nrfgs_ns.training.checkpoint_files import read_latest
 from nrfgs_ns.training.guard import TrainingStopped
 from nrfgs_ns.training.pace import Pace, TimedPace
 from nrfgs_ns.training.trainer import NrfgsTrainer
@@ -26,14 +25,6 @@ CALM = {
     "--pipeline.model.warmup-steps": 0,
 }
 """Nothing but the optimisers changes parameters, after the reset of opacity at step 0."""
-
-
-@pytest.fixture(scope="module")
-def any_share():
-    """Trainings of a few steps may average over any share of them."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(averaging, "LARGEST_SHARE", 1.0)
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -142,8 +133,7 @@ def test_the_window_of_a_training_that_goes_on(trainer):
 
 @pytest.fixture(scope="module")
 def averaged(tiny_scene, tmp_path_factory, any_share):
-    """A training of 12 steps that averages over the last 6, with the checkpoint of step 7, too: its parameters after
-    each step, and its output."""
+    """A training of 12 steps that averages over the last 6: its parameters after each step, and its output."""
     after = {}
     with pytest.MonkeyPatch.context() as patch, CONSOLE.capture() as log:
         average = NrfgsTrainer._average
@@ -154,8 +144,8 @@ def averaged(tiny_scene, tmp_path_factory, any_share):
             after[step] = {name: value.clone() for name, value in tensors if isinstance(value, torch.Tensor)}
 
         patch.setattr(NrfgsTrainer, "_average", note)
-        windows = {"--average-steps": 6, "--steps-per-save": 7}
-        config = trained(command_line("nrfgs", tiny_scene, tmp_path_factory.mktemp("averaged"), 12, CALM, windows))
+        args = command_line("nrfgs", tiny_scene, tmp_path_factory.mktemp("averaged"), 12, CALM, {"--average-steps": 6})
+        config = trained(args)
     return SimpleNamespace(config=config, after=after, said=log.get())
 
 
@@ -168,15 +158,6 @@ def test_the_trained_model_is_the_mean(averaged):
     assert (saved["_model.gauss_params.means"] - averaged.after[11]["gauss_params.means"]).abs().max() > 1e-5
     assert "parameter_mean" not in checkpoint_of(averaged.config)["training"]
     assert "over the last 6 steps." in averaged.said
-
-
-def test_a_mean_continues_to_the_bit(averaged, tiny_scene, tmp_path):
-    """From the middle of the window."""
-    _, content = read_latest(models_of(averaged.config), 7)
-    assert content["training"]["parameter_mean"]["count"] == 2  # steps 6 and 7
-    words = {"--average-steps": 6, "--load-dir": models_of(averaged.config), "--load-step": 7}
-    rest = trained(command_line("nrfgs", tiny_scene, tmp_path, 12, CALM, words))
-    assert_same_training(checkpoint_of(averaged.config), checkpoint_of(rest), rtol=0, atol=0)
 
 
 def test_averaging_changes_no_step(averaged, tiny_scene, tmp_path):

@@ -9,8 +9,6 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from nerfstudio.engine.optimizers import AdamOptimizerConfig
-from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.utils.eval_utils import eval_setup
 from short_trainings import REFINING, assert_same_training, checkpoint_of, command_line, models_of, trained
 
@@ -19,7 +17,6 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.method_config import nrfgs
 from nrfgs_ns.training import pace, trainer_config
 from nrfgs_ns.training.checkpoint_files import find, read
-from nrfgs_ns.training.optimizers import LeanOptimizers
 from nrfgs_ns.training.pace import Pace, TimedPace, resolution_phases, steps_for
 
 LENGTH = 30_000
@@ -90,19 +87,6 @@ def test_steps_of_positions():
     for _ in range(2000):
         pace.advance()
     assert pace.position == LENGTH
-
-
-def test_learning_rates_are_those_of_the_position():
-    """Step s of N has the learning rate of step s L / N of the L that the schedule is laid out for."""
-    decay = ExponentialDecaySchedulerConfig(lr_final=0.001, max_steps=100)
-    config = {"means": {"optimizer": AdamOptimizerConfig(lr=0.1, eps=1e-15), "scheduler": decay}}
-    optimizers = LeanOptimizers(config, {"means": [torch.nn.Parameter(torch.zeros(1))]}, pace=Pace(100, rate=2.5))
-    optimizers.step()  # torch warns if a schedule runs ahead of its optimiser
-    rates = []
-    for step in range(40):
-        rates.append(optimizers.optimizers["means"].param_groups[0]["lr"])
-        optimizers.scheduler_step_all(step)
-    assert rates == pytest.approx([0.1 * 0.01 ** (2.5 * step / 100) for step in range(40)])
 
 
 SCHEDULES = {
