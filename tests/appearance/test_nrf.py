@@ -10,6 +10,7 @@ from torch.testing import assert_close
 
 from nrfgs_ns.appearance.head import SH_C0
 from nrfgs_ns.appearance.nrf import NrfConfig, bounded_opacity
+from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.errors import InputError
 
 
@@ -94,11 +95,11 @@ def test_straight_through_is_a_clamp_whose_gradient_ignores_it_and_logit_the_res
 
 
 @pytest.mark.parametrize(
-    "field, value", [("num_bands", 0), ("latent_dim", 0), ("color_scale", -0.1), ("precision", "fp8")]
+    "field, value", [("num_bands", 0), ("latent_dim", 0), ("color_scale", -0.1), ("precision", "fp8"), ("degree", 4)]
 )
 def test_impossible_settings_are_named(field, value):
     with pytest.raises(ValueError, match=f"appearance.{field} is {value!r}"):
-        NrfConfig(**{field: value}).setup()
+        (ShConfig if field == "degree" else NrfConfig)(**{field: value}).setup()
 
 
 # When the fused kernels are chosen; fused_interpreted.py tests them.

@@ -17,15 +17,11 @@ from nrfgs_ns.rasterizer import ProjectionOptions, contributions, project
 from nrfgs_ns.rasterizer.torch_cpu import batches, compositing, projection
 
 
-def in_precision(case: Case, dtype: torch.dtype) -> Case:
-    options = {k: v.to(dtype) if isinstance(v, torch.Tensor) else v for k, v in case.options.items()}
-    tensors = {k: v.to(dtype) for k, v in vars(case).items() if isinstance(v, torch.Tensor)}
-    return replace(case, **tensors, options=options)
-
-
 def check(case: Case, dtype: torch.dtype = torch.float32, **limits) -> None:
     unit = {torch.float32: FLOAT32, torch.float64: FLOAT64}[dtype]
-    case = in_precision(case, dtype)
+    options = {k: v.to(dtype) if isinstance(v, torch.Tensor) else v for k, v in case.options.items()}
+    tensors = {k: v.to(dtype) for k, v in vars(case).items() if isinstance(v, torch.Tensor)}
+    case = replace(case, **tensors, options=options)
     grads = upstream(case, **limits)
     ours = evaluate(rasterization, case, tuple(g.to(dtype) for g in grads), "cpu")
     assert_agrees(judge(case, grads, unit, **limits), ours, unit)
