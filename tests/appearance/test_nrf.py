@@ -5,7 +5,7 @@ import pytest
 import torch
 from fused_cases import heads
 from fused_cases import scene as fused_scene
-from head_cases import awake, scene, shared_weights
+from head_cases import awake, scene
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.head import SH_C0
@@ -38,9 +38,9 @@ def by_hand(head, splats, visible, centers):
     return torch.stack(colors), torch.cat(opacities)
 
 
-def test_paper_counts():
-    assert shared_weights(NrfConfig().setup()) == 6664
-    assert shared_weights(NrfConfig(split_bands=False).setup()) == 8068
+@pytest.mark.parametrize("split_bands, count", [(True, 6664), (False, 8068)])
+def test_paper_counts(split_bands, count):
+    assert sum(weights.numel() for weights in NrfConfig(split_bands=split_bands).setup().parameters()) == count
 
 
 def test_matches_the_formulas():

@@ -74,14 +74,11 @@ def test_distances_from_1e_30_to_1e30(head, exponent, seed):
 
 
 @pytest.mark.parametrize("head", HEADS)
-@pytest.mark.parametrize(
-    "extreme",
-    [
-        *(Extreme(coordinate=at, distance=distance) for at in (1e-6, 1e6) for distance in (1e-6, 1.0, 1e6)),
-        *(Extreme(latent=size) for size in (1e4, 1e10, 1e20)),
-        *(Extreme(color=color) for color in (-1e18, 1e4, 1e18)),
-    ],
-)
+@pytest.mark.parametrize("extreme", [
+    *(Extreme(coordinate=at, distance=distance) for at in (1e-6, 1e6) for distance in (1e-6, 1.0, 1e6)),
+    *(Extreme(latent=size) for size in (1e4, 1e10, 1e20)),
+    *(Extreme(color=color) for color in (-1e18, 1e4, 1e18)),
+])  # fmt: skip
 def test_coordinates_latents_and_base_colours(head, extreme):
     """At 1e6, float32 sees positions on a grid of 1/16: splats closer than that are on the camera, and no harm done."""
     assert_healthy(*build(head, extreme))

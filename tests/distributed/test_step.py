@@ -125,11 +125,6 @@ Cancellation makes sizes larger than sums, for which 25 is allowed. A gradient t
 by 0.5."""
 
 
-@pytest.fixture(scope="module")
-def on_gpus(run_together):
-    return run_together("fits_one_process", device_type="cuda")
-
-
 @gpus
 def test_step_on_gpus(on_gpus):
     first, second, alone = (torch.load(on_gpus / f"step-{who}.pt", map_location="cpu") for who in (0, 1, "alone"))
