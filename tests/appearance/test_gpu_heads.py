@@ -49,19 +49,16 @@ def test_rounded_products(precision, repeated):
 
 @pytest.mark.parametrize("way", [0, 1])
 @pytest.mark.parametrize("repeated", [False, True])
-@pytest.mark.parametrize(
-    "config",
-    [
-        {"num_bands": 1, "latent_dim": 1, "hidden_width": 5},
-        {"num_bands": 2, "latent_dim": 7, "hidden_width": 20},
-        {"num_bands": 5, "latent_dim": 33, "hidden_width": 64},
-        {"num_bands": 7, "latent_dim": 64, "hidden_width": 30},
-        {"hidden_width": 128},
-        {"num_bands": 1, "latent_dim": 16, "hidden_width": 256, "split_bands": False},
-        {"split_bands": False, "opacity_residual": False},
-        {"opacity_bound": "logit", "use_distance": False},
-    ],
-)
+@pytest.mark.parametrize("config", [
+    {"num_bands": 1, "latent_dim": 1, "hidden_width": 5},
+    {"num_bands": 2, "latent_dim": 7, "hidden_width": 20},
+    {"num_bands": 5, "latent_dim": 33, "hidden_width": 64},
+    {"num_bands": 7, "latent_dim": 64, "hidden_width": 30},
+    {"hidden_width": 128},
+    {"num_bands": 1, "latent_dim": 16, "hidden_width": 256, "split_bands": False},
+    {"split_bands": False, "opacity_residual": False},
+    {"opacity_bound": "logit", "use_distance": False},
+])  # fmt: skip
 def test_sizes_and_ways(config, repeated, way, monkeypatch):
     """Every size that the kernels take, launched in the first way and in the one for small cards."""
     from nrfgs_ns.appearance.fused import launch

@@ -49,14 +49,7 @@ class Image:
 
 
 def project(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    width: int,
-    height: int,
-    *,
+    *arguments: Any,
     near_plane: float = 0.01,
     far_plane: float = 1e10,
     eps2d: float = 0.3,
@@ -70,7 +63,8 @@ def project(
         bounds: what cuts a splat off. square: of three standard deviations along its longest axis, as gsplat 1.4 does
             it. rectangle: of 3.33 along each axis of the image, as gsplat 1.5.
     """
-    means, quats, scales, viewmat, K = (t.double() for t in (means, quats, scales, viewmat, K))
+    *tables, width, height = arguments
+    means, quats, scales, viewmat, K = (t.double() for t in tables)
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     W, t = viewmat[:3, :3], viewmat[:3, 3]
 
