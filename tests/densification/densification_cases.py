@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from scipy.spatial.transform import Rotation
-from short_trainings import command_line, set_up
+from short_trainings import command_line
 from torch.nn import Parameter
 
 from nrfgs_ns.densification import STRATEGIES as CONFIGS
@@ -115,10 +115,6 @@ def arguments(scene: Path, out: Path, densification: str, steps: int = 20, **rul
         "--pipeline.model.few-views": "off",
     }
     return command_line("nrfgs", scene, out, steps, options)
-
-
-def trainer_of(scene: Path, out: Path, densification: str, **rules):
-    return set_up(arguments(scene, out, densification, **rules))
 
 
 def one_step(trainer, step: int) -> dict:

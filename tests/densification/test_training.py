@@ -2,8 +2,8 @@
 """Densification in a training: the losses that it adds, and that a continued training cannot tell."""
 
 import pytest
-from densification_cases import arguments, trainer_of
-from short_trainings import assert_same_training, checkpoint_of, models_of, trained
+from densification_cases import arguments
+from short_trainings import assert_same_training, checkpoint_of, models_of, set_up, trained
 
 from nrfgs_ns.densification import CHANGE, UNSEEN, memory
 from nrfgs_ns.densification.strategy import HELD
@@ -13,7 +13,7 @@ pytestmark = pytest.mark.usefixtures("no_cuda")
 
 
 def test_mcmc_regularises_the_loss_in_training_only(tiny_scene, tmp_path):
-    trainer = trainer_of(tiny_scene, tmp_path, "mcmc")
+    trainer = set_up(arguments(tiny_scene, tmp_path, "mcmc"))
     model = trainer.pipeline.model
     camera, batch = trainer.pipeline.datamanager.next_train(0)
     model.step_cb(trainer.optimizers, 0)
@@ -25,7 +25,7 @@ def test_mcmc_regularises_the_loss_in_training_only(tiny_scene, tmp_path):
 
 
 def test_the_extent_is_that_of_the_training_cameras(tiny_scene, tmp_path):
-    trainer = trainer_of(tiny_scene, tmp_path, "original")
+    trainer = set_up(arguments(tiny_scene, tmp_path, "original"))
     centers = trainer.pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]
     expected = 1.1 * (centers - centers.mean(0)).norm(dim=1).max().item()
     assert trainer.pipeline.model.densification.state["scene_scale"] == pytest.approx(expected)
