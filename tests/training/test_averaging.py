@@ -84,12 +84,10 @@ def test_rows_that_a_strategy_overwrites_in_place_begin_it_anew(trainer, monkeyp
     assert counts(trainer, range(8, 10)) == [1, 2]
 
 
-@pytest.mark.parametrize(
-    "asked, total, size", [(200, 30_000, 200), (200, 300, 6), (200, 20, 1), (7, 300, 6), (3, 300, 3)]
-)
-def test_a_short_training_averages_a_share_of_its_steps(asked, total, size, monkeypatch):
+def test_a_short_training_averages_a_share_of_its_steps(monkeypatch):
     monkeypatch.setattr(averaging, "LARGEST_SHARE", 0.02)
-    assert window(asked, total) == size
+    for asked, total, size in ((200, 30_000, 200), (200, 300, 6), (200, 20, 1), (7, 300, 6), (3, 300, 3)):
+        assert window(asked, total) == size
 
 
 def counts(trainer: NrfgsTrainer, steps: range) -> list[int]:

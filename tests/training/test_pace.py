@@ -97,14 +97,10 @@ SCHEDULES = {
     "--pipeline.model.num-downscales": 1,
 }
 """All that has a schedule, laid out for 40 steps."""
-SH = {"--pipeline.model.appearance.degree-interval": 10}
+SH = {**SCHEDULES, "--pipeline.model.appearance.degree-interval": 10}
 CALM = {"--pipeline.model.densification": "splatfacto,refine_every=1000"}
 """No densification, which every second step would double the splats until a step takes a second."""
 STRETCHED = {"--schedule-steps": 40, "--steps-per-save": 3}
-
-
-def options(scene: Path, out: Path, method: str, steps: int, *more: dict) -> list[str]:
-    return command_line(method, scene, out, steps, SCHEDULES, *more)
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +109,7 @@ def stretched(tiny_scene, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(torch.cuda, "is_available", lambda: False)  # as where it goes on
         every = {"--save-only-latest-checkpoint": False}
-        return trained(options(tiny_scene, tmp_path_factory.mktemp("out"), "nrfgs-sh", 20, SH, STRETCHED, every))
+        return trained(command_line("nrfgs-sh", tiny_scene, tmp_path_factory.mktemp("out"), 20, SH, STRETCHED, every))
 
 
 @pytest.mark.usefixtures("no_cuda")
@@ -134,13 +130,13 @@ def test_a_stretched_training(stretched):
 @pytest.mark.usefixtures("no_cuda")
 def test_a_stretched_training_continues_to_the_bit(stretched, tiny_scene, tmp_path):
     load = {"--load-dir": models_of(stretched), "--load-step": 9}
-    rest = trained(options(tiny_scene, tmp_path / "rest", "nrfgs-sh", 20, SH, STRETCHED, load))
+    rest = trained(command_line("nrfgs-sh", tiny_scene, tmp_path / "rest", 20, SH, STRETCHED, load))
     one, other = checkpoint_of(stretched), checkpoint_of(rest)
     assert one["step"] == 19
     assert_same_training(one, other, rtol=0, atol=0)
     assert one["schedulers"] == other["schedulers"]
     with pytest.raises(InputError, match="schedule-steps"):
-        train(options(tiny_scene, tmp_path / "plain", "nrfgs-sh", 20, SH, load))
+        train(command_line("nrfgs-sh", tiny_scene, tmp_path / "plain", 20, SH, load))
 
 
 class SecondsAStep(TimedPace):
@@ -160,7 +156,8 @@ def test_a_training_ends_when_its_time_is_up(tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(trainer_config, "TimedPace", SecondsAStep)
 
     def run(name, minutes, *more):
-        record = train(options(tiny_scene, tmp_path / name, "nrfgs", 40, CALM, {"--time-budget": minutes}, *more))
+        options = SCHEDULES, CALM, {"--time-budget": minutes}, *more
+        record = train(command_line("nrfgs", tiny_scene, tmp_path / name, 40, *options))
         config = Path(record.config_path)
         state = checkpoint_of(config)
         return record, models_of(config), state["step"], state["training"]["pace"]
