@@ -86,18 +86,12 @@ class Inspect(NamesTraining):
 class Row:
     """One field, measured."""
 
-    part: str
-    """the part left out"""
-    group: str
-    """full, part, rank, together"""
-    psnr: float
-    """mean over the views, dB"""
-    loss_db: float
-    """the full field's PSNR minus this one's"""
-    bytes: int
-    """of splats and head, float32"""
-    head_seconds: float
-    """mean over the views"""
+    part: str  # the part left out
+    group: str  # full, part, rank, together
+    psnr: float  # mean over the views, dB
+    loss_db: float  # the full field's PSNR minus this one's
+    bytes: int  # of splats and head, float32
+    head_seconds: float  # mean over the views
 
 
 Candidate = tuple[str, str, Callable[[Field], Field]]
@@ -120,12 +114,7 @@ def changes(field: Field, basis: LatentBasis, distance: float) -> Iterator[Candi
 
 
 class FieldViews:
-    """Views with their photographs, projected once: no change moves a splat.
-
-    Args:
-        model: in evaluation mode.
-        views: pairs of a camera and its batch; at least one.
-    """
+    """Views, each a camera and its batch, projected once: no change moves a splat. The model is in evaluation mode."""
 
     def __init__(self, model, views: list):
         self.model, self.views = model, []

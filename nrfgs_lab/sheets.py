@@ -6,8 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-GAP = 4
-"""Pixels between pictures."""
+GAP = 4  # Pixels between pictures.
 
 
 def picture(values) -> Image.Image:
@@ -18,11 +17,8 @@ def picture(values) -> Image.Image:
 def sheet(
     rows: Sequence[Sequence[tuple[str, Image.Image]]], gap: int = GAP, title: int = 16, font: int = 10
 ) -> Image.Image:
-    """Rows of pictures, each with its title above; a row without titles leaves no room for them.
-
-    Args:
-        gap, title, font: pixels between pictures, for a line of titles, and of its letters.
-    """
+    """Rows of pictures, each with its title above; a row without titles leaves no room for them. Pixels: `gap` between
+    pictures, `title` for a line of titles, `font` of its letters."""
     rooms = [title * any(name for name, _ in row) for row in rows]
     heights = [room + max(part.height for _, part in row) for room, row in zip(rooms, rows, strict=True)]
     width = max(sum(part.width + gap for _, part in row) for row in rows) - gap

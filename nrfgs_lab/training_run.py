@@ -27,21 +27,15 @@ import nrfgs_ns
 class TrainRecord:
     """Cost of one training."""
 
-    args: list[str]
-    """the command, after `ns-train`"""
+    args: list[str]  # the command, after `ns-train`
     config_path: str
-    steps: int = 0
-    """completed steps"""
-    seconds: float = 0.0
-    """wall-clock of those steps, warm-up included, loading of images and start-up excluded"""
-    peak_memory_bytes: int | None = None
-    """most GPU memory in tensors; None on a CPU"""
+    steps: int = 0  # completed steps
+    seconds: float = 0.0  # wall-clock of those steps, warm-up included, loading of images and start-up excluded
+    peak_memory_bytes: int | None = None  # most GPU memory in tensors; None on a CPU
     splats: list[list[int]] = field(default_factory=list)
     """pairs (step, number of splats), every hundredth step and the last"""
-    saved: list[list[float]] = field(default_factory=list)
-    """pairs (step, seconds until then) of the checkpoints"""
-    parts: int = 1
-    """number of processes: more than one if it was interrupted and went on from a checkpoint"""
+    saved: list[list[float]] = field(default_factory=list)  # pairs (step, seconds until then) of the checkpoints
+    parts: int = 1  # number of processes: more than one if it was interrupted and went on from a checkpoint
 
 
 def parse(args: list[str]) -> TrainerConfig:
@@ -115,11 +109,8 @@ def train(
 
 
 def evaluate(config_path: Path, output_path: Path, pictures: Path | None = None) -> dict[str, Any]:
-    """Run `ns-eval --load-config CONFIG_PATH --output-path OUTPUT_PATH` in this process; returns its results.
-
-    Args:
-        pictures: folder for pictures of the test views (--render-output-path); None: write none.
-    """
+    """Run `ns-eval --load-config CONFIG_PATH --output-path OUTPUT_PATH` in this process; returns its results. With a
+    folder for pictures of the test views it writes them (--render-output-path)."""
     ComputePSNR(Path(config_path), Path(output_path), pictures).main()
     results = json.loads(Path(output_path).read_text())["results"]
     return {name: None if value != value else value for name, value in results.items()}  # NaN is no number: null

@@ -93,6 +93,16 @@ def no_cuda(monkeypatch):
     monkeypatch.setattr(torch.nn.Module, "cuda", refuse)
 
 
+@pytest.fixture(scope="module")
+def any_share():
+    """Let trainings of a few steps average over any share of them."""
+    from nrfgs_ns.training import averaging
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(averaging, "LARGEST_SHARE", 1.0)
+        yield
+
+
 @pytest.fixture
 def no_heif(monkeypatch):
     """Hide pillow-heif."""

@@ -10,30 +10,18 @@ from PIL import Image, ImageDraw
 from nrfgs_lab.sheets import GAP, picture, sheet
 from nrfgs_ns.files import whole
 
-VIEWS = 2
-"""Views in a sheet."""
-CROP_FRACTION = 0.3
-"""Side of a crop, in shorter sides of the image."""
-CROP_PIXELS = 220
-"""Side of a crop in the sheet."""
-ERROR_GAIN = 4.0
-"""Factor of the error maps."""
-ACROSS = 8
-"""Crops side by side, with the truth; more go below."""
+VIEWS = 2  # Views in a sheet.
+CROP_FRACTION = 0.3  # Side of a crop, in shorter sides of the image.
+CROP_PIXELS = 220  # Side of a crop in the sheet.
+ERROR_GAIN = 4.0  # Factor of the error maps.
+ACROSS = 8  # Crops side by side, with the truth; more go below.
 
 Images = npt.NDArray[np.float32]
 
 
 def crop_sheet(pictures: dict[str, Path], path: Path) -> None:
-    """Write a PNG of the views where runs differ most: renderings above |error| x 4, the whole truth on the left.
-
-    Args:
-        pictures: label -> folder of ns-eval's pictures of a run.
-        path: where the PNG goes, if there is a view that all runs have.
-
-    Raises:
-        ValueError: their pictures differ in size.
-    """
+    """Write a PNG of the views where runs differ most, if there is one that all have: renderings above |error| x 4, the
+    whole truth on the left. `pictures`: label -> folder of ns-eval's; ValueError if they differ in size."""
     files = {label: files for label, folder in pictures.items() if (files := numbered(folder))}
     places = []
     for view in sorted(set.intersection(*map(set, files.values()))) if files else ():

@@ -14,18 +14,12 @@ from nrfgs_ns.errors import InputError
 class Job:
     """A training, and where its results go. The last three are those of `Spec`."""
 
-    args: list[str]
-    """command line of ns-train"""
-    cell: dict[str, Any]
-    """its run, strategy, scene and seed"""
-    identity: dict[str, Any]
-    """what decides the result, without paths"""
-    steps: int | None
-    """training steps in all; None: the method chooses them"""
-    record: str
-    """file to write"""
-    work: str
-    """folder for everything else"""
+    args: list[str]  # command line of ns-train
+    cell: dict[str, Any]  # its run, strategy, scene and seed
+    identity: dict[str, Any]  # what decides the result, without paths
+    steps: int | None  # training steps in all; None: the method chooses them
+    record: str  # file to write
+    work: str  # folder for everything else
     train_views: int
     jobs: int
     quick: bool = False
@@ -51,11 +45,8 @@ def command(spec: Spec, cell: Cell, parser: list[str], work: Path) -> list[str]:
 
 
 def identity(spec: Spec, cell: Cell, parser: list[str] | None) -> dict[str, Any]:
-    """What decides a run's result, without paths, which differ between machines.
-
-    Args:
-        parser: as for `command`; None: how the data are read is not compared.
-    """
+    """What decides a run's result, without paths, which differ between machines; without a `parser`, as for `command`,
+    how the data are read is not compared."""
     drop = ("--output-dir", "--steps-per-save")
     args = command(spec, cell, [], Path())
     kept = [word for before, word in zip(["", *args], args, strict=False) if word not in drop and before not in drop]

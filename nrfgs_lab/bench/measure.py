@@ -20,22 +20,14 @@ from nrfgs_lab.training_run import synchronize
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.image.metrics import METRIC_NAMES, image_metrics
 
-TIMED_CAMERAS = 20
-"""Test cameras, evenly spaced, for frames per second."""
-TIMED_SECONDS = 1.0
-"""Shortest time of rendering them in turn."""
-FULL_HD = 1920, 1080
-"""Second size for frames per second."""
+TIMED_CAMERAS = 20  # Test cameras, evenly spaced, for frames per second.
+TIMED_SECONDS = 1.0  # Shortest time of rendering them in turn.
+FULL_HD = 1920, 1080  # Second size for frames per second.
 
 
 @torch.no_grad()
 def measure(config_path: Path, train_views: int, timed: bool = True) -> dict[str, Any]:
-    """Load the last checkpoint of a training and measure it at full resolution.
-
-    Args:
-        config_path: the config.yml that the training saved.
-        train_views: number of training images, evenly spaced.
-        timed: measure frames per second; they need an idle GPU.
+    """Load the last checkpoint of a training and measure it at full resolution; frame rates (`timed`) need an idle GPU.
 
     Returns:
         "test" and "train" (null without views), each with "per_image" and means of psnr, ssim, ms_ssim, l1, lpips (null
@@ -88,15 +80,9 @@ def over_views(model, views: Iterable) -> dict[str, Any]:
 
 
 def flip(pred: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float | None:
-    """Mean FLIP (Andersson et al., PACMCGIT 3(2), 2020) in [0, 1] at 67 pixels a degree; lower is better.
-
-    Args:
-        pred, truth: sRGB images [H, W, 3] in [0, 1].
-        mask: bool [H, W, 1]; outside, the images count as equal and no pixel enters the mean.
-
-    Returns:
-        None if the mask is empty.
-    """
+    """Mean FLIP (Andersson et al., PACMCGIT 3(2), 2020) of sRGB images [H, W, 3] in [0, 1] at 67 pixels a degree; lower
+    is better. Outside the mask, bool [H, W, 1], the images count as equal and no pixel enters the mean; None if it is
+    empty."""
     import flip_evaluator
 
     inside = np.ones_like(truth[..., :1], dtype=bool) if mask is None else mask

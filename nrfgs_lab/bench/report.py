@@ -17,15 +17,9 @@ FAILURE = ".failed"
 
 
 def report(spec: Spec, cells: list[Cell], out: Path, work: Path, stale: dict[str, str]) -> None:
-    """Print the table; write table.md, summary.json, crops/, with knobs tradeoff.{md,png} into OUT.
-
-    Args:
-        spec: the benchmark.
-        cells: the trainings to report.
-        out: folder of the report; its runs/ holds the records.
-        work: folder of the trainings, for their pictures; without them there are no crops.
-        stale: records to leave out: name -> difference.
-    """
+    """Print the table; write table.md, summary.json, crops/, with knobs tradeoff.{md,png} into OUT, whose runs/ holds
+    the records. `stale` ones, name -> difference, are left out. Without the trainings' pictures in `work` there are no
+    crops."""
     rows = rows_from_records(cells, out / "runs", stale)
     for name, difference in stale.items():
         print(f"{name} is stale: it was made with {difference}")
@@ -77,12 +71,7 @@ def rows_from_records(cells: list[Cell], runs: Path, stale: dict[str, str]) -> l
 
 def summary(row: Row) -> dict[str, Any]:
     """A row as plain data."""
+    place = {"scene": row.scene, "run": row.run, "strategy": row.strategy, "seeds": sorted(row.records)}
+    absent = {str(seed): why for seed, why in row.absent.items()}
     values = {column.name: [row.mean(column), row.deviation(column)] for column in COLUMNS}
-    return {
-        "scene": row.scene,
-        "run": row.run,
-        "strategy": row.strategy,
-        "seeds": sorted(row.records),
-        "absent": {str(seed): why for seed, why in row.absent.items()},
-        **values,
-    }
+    return {**place, "absent": absent, **values}

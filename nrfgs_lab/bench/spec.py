@@ -24,40 +24,26 @@ class Method:
     """A run: a row of the table."""
 
     name: str
-    method: str
-    """method of ns-train"""
-    options: tuple[str, ...] = ()
-    """its options"""
-    strategies: tuple[str, ...] = ()
-    """instead of the benchmark's; another project's methods have only `own` by default"""
-    steps: int | str | None = None
-    """instead of the preset's, the scene's or the benchmark's; own: what the method chooses"""
-    scenes: tuple[str, ...] = ()
-    """only these scenes"""
-    knob: str = ""
-    """the knob that is varied"""
+    method: str  # method of ns-train
+    options: tuple[str, ...] = ()  # its options
+    strategies: tuple[str, ...] = ()  # instead of the benchmark's; another project's methods have only `own` by default
+    steps: int | str | None = None  # instead of the preset's, scene's or benchmark's; own: what the method chooses
+    scenes: tuple[str, ...] = ()  # only these scenes
+    knob: str = ""  # the knob that is varied
 
 
 @dataclass(frozen=True)
 class Scene:
     """A data set, and how it is read."""
 
-    path: str
-    """folder below --scenes"""
-    downscale: int | None = None
-    """read images_N; None: by size in nerfstudio's layout, full size in COLMAP's"""
-    options: tuple[str, ...] = ()
-    """options of the data parser"""
-    steps: int | None = None
-    """training steps, instead of the benchmark's"""
-    views: int | None = None
-    """number of training views to keep, evenly spaced"""
-    held_out: int | None = None
-    """first held-out view"""
-    held_out_every: int = 8
-    """from one held-out view to the next"""
-    held_out_by: str = "name"
-    """order of the views; place: blocks along the cameras' longest axis are held out, which leaves gaps"""
+    path: str  # folder below --scenes
+    downscale: int | None = None  # read images_N; None: by size in nerfstudio's layout, full size in COLMAP's
+    options: tuple[str, ...] = ()  # options of the data parser
+    steps: int | None = None  # training steps, instead of the benchmark's
+    views: int | None = None  # number of training views to keep, evenly spaced
+    held_out: int | None = None  # first held-out view
+    held_out_every: int = 8  # from one held-out view to the next
+    held_out_by: str = "name"  # order of the views; place: blocks along the cameras' longest axis, which leaves gaps
 
     @property
     def name(self) -> str:
@@ -73,34 +59,20 @@ class Scene:
 class Spec:
     """A benchmark."""
 
-    runs: list[Method]
-    """methods with options"""
-    scenes: list[Scene]
-    """data sets"""
-    strategies: list[str] = field(default_factory=lambda: [OWN])
-    """values of --pipeline.model.densification; NAME@N: NAME,budget=N; own: no option"""
-    seeds: list[int] = field(default_factory=lambda: [42])
-    """--machine.seed of each repetition"""
-    steps: int = 30_000
-    """training steps, except of scenes, presets and runs that have their own"""
-    options: tuple[str, ...] = ()
-    """options of ns-train for every run"""
-    held_out: list[int] = field(default_factory=list)
-    """first held-out view; each number makes one held-out version of each scene"""
-    held_out_every: int = 8
-    """from one held-out view to the next"""
-    held_out_by: str = "name"
-    """order of the views (see `Scene`)"""
-    quick: bool = False
-    """quality alone: no ns-eval, pictures or frame rates; checkpoints are removed"""
-    train_views: int = 16
-    """training images to evaluate, evenly spaced"""
-    checkpoint_every: int = 5_000
-    """steps between checkpoints"""
-    jobs: int = 1
-    """runs at once on each GPU, or on the CPU"""
-    gpus: int = 1
-    """GPUs to spread the runs over"""
+    runs: list[Method]  # methods with options
+    scenes: list[Scene]  # data sets
+    strategies: list[str] = field(default_factory=lambda: [OWN])  # densification; NAME@N: NAME,budget=N; own: no option
+    seeds: list[int] = field(default_factory=lambda: [42])  # --machine.seed of each repetition
+    steps: int = 30_000  # training steps, except of scenes, presets and runs that have their own
+    options: tuple[str, ...] = ()  # options of ns-train for every run
+    held_out: list[int] = field(default_factory=list)  # first views; each makes a held-out version of each scene
+    held_out_every: int = 8  # from one held-out view to the next
+    held_out_by: str = "name"  # order of the views (see `Scene`)
+    quick: bool = False  # quality alone: no ns-eval, pictures or frame rates; checkpoints are removed
+    train_views: int = 16  # training images to evaluate, evenly spaced
+    checkpoint_every: int = 5_000  # steps between checkpoints
+    jobs: int = 1  # runs at once on each GPU, or on the CPU
+    gpus: int = 1  # GPUs to spread the runs over
 
 
 @dataclass(frozen=True)

@@ -18,16 +18,11 @@ class Column:
     """One measured quantity."""
 
     name: str
-    value: Callable[[Record], float | None]
-    """value in a run's record, or None"""
-    form: str
-    """format"""
-    better: int = 0
-    """1: more is better, -1: less is better, 0: no ranking"""
-    unit: float = 1.0
-    """values are divided by this"""
-    is_time: bool = False
-    """valid only for runs alone on their GPU, and comparable on one machine"""
+    value: Callable[[Record], float | None]  # value in a run's record, or None
+    form: str  # format
+    better: int = 0  # 1: more is better, -1: less is better, 0: no ranking
+    unit: float = 1.0  # values are divided by this
+    is_time: bool = False  # valid only for runs alone on their GPU, and comparable on one machine
 
 
 def _at(*keys: str) -> Callable[[Record], float | None]:
@@ -79,14 +74,10 @@ class Row:
     scene: str
     run: str
     strategy: str
-    records: dict[int, Record] = field(default_factory=dict)
-    """seed -> record"""
-    absent: dict[int, str] = field(default_factory=dict)
-    """seed -> one of `ABSENCES`"""
-    values: dict[str, dict[int, float]] = field(default_factory=dict)
-    """column -> seed -> value"""
-    devices: set[str] = field(default_factory=set)
-    """machines of the records"""
+    records: dict[int, Record] = field(default_factory=dict)  # seed -> record
+    absent: dict[int, str] = field(default_factory=dict)  # seed -> one of `ABSENCES`
+    values: dict[str, dict[int, float]] = field(default_factory=dict)  # column -> seed -> value
+    devices: set[str] = field(default_factory=set)  # machines of the records
 
     def fill(self) -> "Row":
         """Set the columns' values from the records."""

@@ -42,10 +42,8 @@ LEGEND = (
 class Change:
     """The change of one quantity against the default."""
 
-    value: float
-    """difference, or ratio where `is_ratio`"""
-    noise: float
-    """largest difference, or ratio, that is noise; infinite if the spread is unknown"""
+    value: float  # difference, or ratio where `is_ratio`
+    noise: float  # largest difference, or ratio, that is noise; infinite if the spread is unknown
     is_ratio: bool = False
 
     @property
@@ -75,11 +73,8 @@ def noise_bound(deviation: float | None, freedom: int, n: int, m: int) -> float:
 
 
 def changes(rows: Sequence[Row], default: Row, column: Column, ratio: bool) -> dict[str, Change]:
-    """Change of a column against the default by run, for rows of one scene with values in it.
-
-    Args:
-        ratio: compare positive values as ratios.
-    """
+    """Change of a column against the default by run, for rows of one scene with values in it; of positive values, as a
+    ratio."""
     samples = {row.run: list(row.values[column.name].values()) for row in rows}
     if ratio:
         samples = {run: [math.log(value) for value in values if value > 0] for run, values in samples.items()}
@@ -95,13 +90,8 @@ def changes(rows: Sequence[Row], default: Row, column: Column, ratio: bool) -> d
 
 
 def price(gain: Change | None, cost: Change | None, power: int = 1) -> str:
-    """What a setting buys: dB for each doubling of a cost, or in words what else it is.
-
-    Args:
-        gain: change of PSNR, dB.
-        cost: change of the cost's column, a ratio.
-        power: the cost is the column to this power.
-    """
+    """What a setting buys, from changes of PSNR and of the cost's column, a ratio, whose `power` is the cost: dB for
+    each doubling of the cost, or in words what else it is."""
     if gain is None or cost is None:
         return "-"
     if gain.is_noise:
@@ -133,12 +123,8 @@ def front_of(rows: Sequence[Row], cost: str) -> list[str]:
 
 
 def report(rows: list[Row], knobs: dict[str, str], out: Path) -> None:
-    """Write OUT/tradeoff.{md,png} and print the table.
-
-    Args:
-        rows: those of a plan with knobs, and their averages over scenes.
-        knobs: run -> knob.
-    """
+    """Write OUT/tradeoff.{md,png} and print the table: rows with their averages over scenes, and the knob of each
+    run."""
     texts = []
     for scene in dict.fromkeys(row.scene for row in rows):
         of_scene = [row for row in rows if row.scene == scene]

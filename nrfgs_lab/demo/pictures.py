@@ -10,21 +10,14 @@ from torch import Tensor
 from nrfgs_lab.demo.views import Highlight, SeenView, brightest_window
 from nrfgs_lab.sheets import picture, sheet
 
-CELL = 240
-"""Width of a picture, pixels."""
-ERROR_GAIN = 4.0
-"""Factor of absolute errors in the error maps."""
-RESIDUAL_GAIN = 4.0
-"""Factor of the field's view-dependent part, around mid grey."""
+CELL = 240  # Width of a picture, pixels.
+ERROR_GAIN = 4.0  # Factor of absolute errors in the error maps.
+RESIDUAL_GAIN = 4.0  # Factor of the field's view-dependent part, around mid grey.
 
 
 def contact_sheet(views: dict[str, list[SeenView]], path: Path) -> None:
     """Write a picture of three test views, each whole and below it where it shines most: truth, each method and its
-    error, and what the field adds to its base colour.
-
-    Args:
-        views: label -> its test views; the first is the field's.
-    """
+    error, and what the field adds to its base colour. `views`: label -> its test views; the first is the field's."""
     label, nrf = next(iter(views.items()))
     columns = {"truth": [view.truth for view in nrf]}
     for name, seen in views.items():

@@ -16,10 +16,8 @@ from nrfgs_ns.image.metrics import psnr
 
 SHINES = 0.1
 """Change of white by gloss, in its strongest channel, from which a pixel of the truth counts as one that shines."""
-ARC = 24.0
-"""Angle over which the camera moves around a highlight, degrees."""
-FRAMES = 7
-"""Views along that arc."""
+ARC = 24.0  # Angle over which the camera moves around a highlight, degrees.
+FRAMES = 7  # Views along that arc.
 
 
 @dataclass
@@ -27,11 +25,9 @@ class SeenView:
     """One view of the scene, as a trained model shows it. Pictures are [H, W, 3] in [0, 1]."""
 
     truth: Tensor
-    dull: Tensor
-    """the truth without gloss, as the ray tracer has it"""
+    dull: Tensor  # the truth without gloss, as the ray tracer has it
     rendered: Tensor
-    base: Tensor
-    """base colours and opacities alone"""
+    base: Tensor  # base colours and opacities alone
 
     @property
     def shine(self) -> Tensor:
@@ -43,8 +39,7 @@ class SeenView:
 class Highlight:
     """The same place on a surface while the camera moves around it. Pictures are [H, W, 3] in [0, 1]."""
 
-    window: tuple[int, int, int, int]
-    """top, left, height and width of the place in each picture, pixels"""
+    window: tuple[int, int, int, int]  # top, left, height and width of the place in each picture, pixels
     truths: list[Tensor]
     rendered: list[Tensor]
 
@@ -74,11 +69,8 @@ class Look:
         return views
 
     def highlight(self, view: int, shine: Tensor) -> Highlight:
-        """The place of test view `view` where gloss does most, from an arc of views about the vertical through it.
-
-        Args:
-            shine: of that view, [H, W].
-        """
+        """The place of test view `view` where gloss does most, from an arc of views about the vertical through it;
+        `shine` is of that view, [H, W]."""
         window = brightest_window(shine)
         middle = np.array([[window[1] + 0.5 * window[3], window[0] + 0.5 * window[2]]])
         points, _ = self.glossy.first_hit(*camera_rays(self.scene, self.poses[view], middle))

@@ -202,10 +202,7 @@ NrfgsVdgs, NrfgsGsnb, NrfgsSg = map(_method, ("vdgs", "gsnb", "sg"))
 
 
 def configure(method: str, overrides: dict[str, Any], metadata: dict[str, Any]) -> NrfgsTrainerConfig:
-    """The configuration of a training, parsed as by `ns-train`.
-
-    Args:
-        overrides: options and their values, which win over the data set's background in `metadata`.
+    """The configuration of a training, parsed as by `ns-train`; `overrides` win over the data set's background.
 
     Raises:
         InputError: an option belongs to what nerfbaselines does itself, or the background is neither black nor white.
@@ -255,10 +252,8 @@ def _build_model(config: NrfgsTrainerConfig, record: dict[str, Any], content: di
 class World(NamedTuple):
     """The map from the data set's world to the one that is trained in, x -> scale (R x + t)."""
 
-    transform: Tensor
-    """[R | t], float64 [3, 4], R a rotation"""
-    scale: float
-    """> 0"""
+    transform: Tensor  # [R | t], float64 [3, 4], R a rotation
+    scale: float  # > 0
 
     @classmethod
     def around(cls, poses: np.ndarray, options: NrfgsDataParserConfig) -> "World":
@@ -314,8 +309,10 @@ def hold_in_memory(config: NrfgsDatamanagerConfig, dataset: dict[str, Any], worl
         """The images in memory, which nerfbaselines may have padded to one size."""
 
         def _cropped(self, images, index: int) -> np.ndarray:
+            """Bytes as they are, truth values as 0 and 255, floats in [0, 1] times 255, rounded."""
             width, height = self._sizes[index]
-            return _as_bytes(np.asarray(images[index])[:height, :width])
+            image = np.asarray(images[index])[:height, :width]
+            return image if image.dtype == np.uint8 else np.rint(255.0 * np.clip(image, 0.0, 1.0)).astype(np.uint8)
 
         def get_numpy_image(self, image_idx: int) -> np.ndarray:
             image = self._cropped(images, image_idx)
@@ -340,10 +337,3 @@ def hold_in_memory(config: NrfgsDatamanagerConfig, dataset: dict[str, Any], worl
 
     config._target, config.dataparser._target = GivenDatamanager, GivenParser
     config.image_memory = math.inf  # they are in memory
-
-
-def _as_bytes(image: np.ndarray) -> np.ndarray:
-    """Bytes as they are, truth values as 0 and 255, floats in [0, 1] times 255, rounded."""
-    if image.dtype == np.uint8:
-        return image
-    return np.rint(255.0 * np.clip(image, 0.0, 1.0)).astype(np.uint8)

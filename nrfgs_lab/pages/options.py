@@ -49,11 +49,9 @@ rates, `--optimizers.NAME.optimizer.lr` to `.scheduler.lr-final`.
 class Option(NamedTuple):
     """An item of the page."""
 
-    flag: str
-    """with dots and hyphens, without leading hyphens"""
+    flag: str  # with dots and hyphens, without leading hyphens
     default: Any
-    text: str
-    """explanation"""
+    text: str  # explanation
 
 
 def own_options(config: Any, prefix: str = "") -> Iterator[Option]:

@@ -25,15 +25,12 @@ FIREFOX = shutil.which("firefox") or shutil.which("firefox-esr")
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
 PATIENCE, REST = 300_000, 60_000
 """Milliseconds to wait for anything on a slow, busy machine, and until the viewer's picture is whole."""
-PORT = 7011
-"""Of the viewer."""
-WIDTH, COLUMNS = 300, 3
-"""The sheet of modes: width of one in pixels, and number of columns."""
+PORT = 7011  # Of the viewer.
+WIDTH, COLUMNS = 300, 3  # The sheet of modes: width of one in pixels, and number of columns.
 WINDOWS = {"desktop": ((1280, 760), {}), "phone": ((390, 844), {"has_touch": True, "device_scale_factor": 2})}
 SHOWN = {"page": None, "view": "View", "share": "Share"}
 """Pictures of each window: the part of the panel that is open."""
-HEIGHT, BETWEEN = 600, 16
-"""Pixels of the picture of a page, and of the gap between its two halves."""
+HEIGHT, BETWEEN = 600, 16  # Pixels of the picture of a page, and of the gap between its two halves.
 
 
 @contextlib.contextmanager

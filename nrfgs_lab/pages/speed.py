@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from nrfgs_lab.bench.table import Row
 from nrfgs_lab.pages.runs import VIEWS, bench_rows, grid, mean_of, records, span
 
 SITTING = timedelta(minutes=10)
@@ -43,18 +42,13 @@ PRESETS = {
 }
 
 
-def _preset(scene: str, run: str) -> tuple[Row | None, str]:
-    """A run, and a mark if it was made on another day than most."""
-    row = bench_rows("speed").get((scene, "own", run))
+def _preset(scene: str, run: str) -> str:
+    """A run's cell, with a mark if it was made on another day than most."""
+    row, mark = bench_rows("speed").get((scene, "own", run)), ""
     if row is None and run.startswith("splatfacto"):
-        return bench_rows("presets").get((scene, "own", f"nerfstudio_{run}")), "*"
+        row, mark = bench_rows("presets").get((scene, "own", f"nerfstudio_{run}")), "*"
     if row is None and run == "nrfgs":  # it chooses 10,000 steps, and is the preset
-        return bench_rows("speed").get((scene, "own", "nrfgs-fast")), ""
-    return row, ""
-
-
-def _preset_cell(scene: str, run: str) -> str:
-    row, mark = _preset(scene, run)
+        row = bench_rows("speed").get((scene, "own", "nrfgs-fast"))
     if row is None:
         return "-"
     seconds = list(row.values["time s"].values())
@@ -65,7 +59,7 @@ def _preset_cell(scene: str, run: str) -> str:
 
 def presets() -> str:
     """PSNR, SSIM, splats and seconds of a user's choices."""
-    body = [[label, *(_preset_cell(scene, run) for scene in CAPTURES)] for run, label in PRESETS.items()]
+    body = [[label, *(_preset(scene, run) for scene in CAPTURES)] for run, label in PRESETS.items()]
     return grid(["PSNR/SSIM, splats, time", *(f"{scene}, {VIEWS[scene]} views" for scene in CAPTURES)], body)
 
 

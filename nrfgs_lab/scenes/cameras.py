@@ -10,14 +10,10 @@ from .geometry import Array
 from .scene import Scene
 from .shading import tone_curve
 
-DISTANCE = 4.3
-"""Mean distance from the cameras to the target, world units; each camera's own is within 8 %."""
-TARGET = (0.0, 0.0, 0.35)
-"""Point that the cameras look at, give or take a jitter of 0.1, world units."""
-ELEVATIONS = (14.0, 52.0)
-"""Lowest and highest elevation seen from the target, degrees."""
-RAYS_AT_ONCE = 1 << 14
-"""Rays traced together: temporaries of this length stay in a core's cache."""
+DISTANCE = 4.3  # Mean distance from the cameras to the target, world units; each camera's own is within 8 %.
+TARGET = (0.0, 0.0, 0.35)  # Point that the cameras look at, give or take a jitter of 0.1, world units.
+ELEVATIONS = (14.0, 52.0)  # Lowest and highest elevation seen from the target, degrees.
+RAYS_AT_ONCE = 1 << 14  # Rays traced together: temporaries of this length stay in a core's cache.
 
 
 def dome_cameras(config: SceneConfig) -> Array:

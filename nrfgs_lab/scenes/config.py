@@ -14,28 +14,17 @@ class SceneConfig:
     InputError if gloss or seed, which `nrfgs demo` takes, is outside its range.
     """
 
-    gloss: float = 1.0
-    """Weight g of everything specular, in [0, 1]. At 0 each surface point has one colour, whatever the view."""
-    studio: bool = False
-    """A dozen lamps, one satin finish on all objects and no mirrors: small highlights, and nothing else reflected."""
-    arc: float = 360.0
-    """Range of the cameras' azimuths, degrees, in (0, 360]."""
-    views: int = 48
-    """Number of images, at least 2."""
-    width: int = 200
-    """Image width, pixels."""
-    height: int = 150
-    """Image height, pixels."""
-    samples: int = 2
-    """Rays per pixel side: a pixel is the mean of samples x samples rays on a regular grid."""
-    field_of_view: float = 50.0
-    """Horizontal field of view, degrees, in (0, 120]."""
-    points: int = 5000
-    """Surface points in the sparse point cloud."""
-    test_every: int = 8
-    """Every test_every-th image by name (0, n, 2n, ...) is a test image; at least 2, so that some image trains."""
-    seed: int = 0
-    """Decides the noise in the textures, the jitter of the cameras and the choice of sparse points."""
+    gloss: float = 1.0  # Weight g of everything specular, in [0, 1]. At 0 each point has one colour, whatever the view.
+    studio: bool = False  # A dozen lamps, one satin finish, no mirrors: small highlights, and nothing else reflected.
+    arc: float = 360.0  # Range of the cameras' azimuths, degrees, in (0, 360].
+    views: int = 48  # Number of images, at least 2.
+    width: int = 200  # Image width, pixels.
+    height: int = 150  # Image height, pixels.
+    samples: int = 2  # Rays per pixel side: a pixel is the mean of samples x samples rays on a regular grid.
+    field_of_view: float = 50.0  # Horizontal field of view, degrees, in (0, 120].
+    points: int = 5000  # Surface points in the sparse point cloud.
+    test_every: int = 8  # Images 0, n, 2n, ... by name are test images; at least 2, so that some image trains.
+    seed: int = 0  # Decides the noise in the textures, the jitter of the cameras and the choice of sparse points.
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.gloss <= 1.0:

@@ -23,10 +23,8 @@ from .geometry import Array
 from .scene import Scene, build_scene
 from .shading import tone_curve
 
-SCENE_VERSION = 2
-"""Raise it when the same config begins to give different pictures."""
-SEEN_TOLERANCE = 1e-3
-"""A view sees a surface point when its ray ends within this distance of it, world units."""
+SCENE_VERSION = 2  # Raise it when the same config begins to give different pictures.
+SEEN_TOLERANCE = 1e-3  # A view sees a surface point when its ray ends within this distance of it, world units.
 
 
 def split_names(config: SceneConfig) -> tuple[list[str], list[str]]:
@@ -37,13 +35,10 @@ def split_names(config: SceneConfig) -> tuple[list[str], list[str]]:
 
 
 def write_scene(config: SceneConfig, out: Path, advance: Callable[[], object] = lambda: None) -> Path:
-    """Render a scene and write it as a nerfstudio data set; reuse `out` when it already holds exactly that.
+    """Render a scene and write it as a nerfstudio data set; reuse `out` when it already holds exactly that, and raise
+    FileExistsError when it holds anything else. `advance` is called after each picture.
 
     The data set is written beside `out` and moved there when it is complete: an interrupted run leaves no half of one.
-    `advance` is called after each picture.
-
-    Raises:
-        FileExistsError: when `out` holds anything else: another scene, other files.
     """
     record = {"version": SCENE_VERSION, "config": asdict(config)}
     if out.is_file() or (out.is_dir() and any(out.iterdir())):
@@ -118,21 +113,10 @@ def _write_files(scene: Scene, folder: Path, advance: Callable[[], object]) -> N
     is_train = np.isin(names, train)
     points, colours = sparse_points(scene, cameras[is_train])
     write_ply(folder / "sparse.ply", points, np.round(255.0 * colours).astype(np.uint8))
-    transforms = {
-        "camera_model": "OPENCV",
-        "w": config.width,
-        "h": config.height,
-        **dict.fromkeys(("fl_x", "fl_y"), config.focal_length),
-        "cx": 0.5 * config.width,
-        "cy": 0.5 * config.height,
-        **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
-        "ply_file_path": "sparse.ply",
-        "train_filenames": train,
-        "val_filenames": test,
-        "test_filenames": test,
-        "frames": [
-            {"file_path": name, "transform_matrix": camera.tolist()}
-            for name, camera in zip(names, cameras, strict=True)
-        ],
-    }
+    lens = {"w": config.width, "h": config.height, **dict.fromkeys(("fl_x", "fl_y"), config.focal_length)}
+    lens |= {"cx": 0.5 * config.width, "cy": 0.5 * config.height, **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)}
+    split = {"train_filenames": train, "val_filenames": test, "test_filenames": test}
+    places = zip(names, cameras, strict=True)
+    frames = [{"file_path": name, "transform_matrix": camera.tolist()} for name, camera in places]
+    transforms = {"camera_model": "OPENCV", **lens, "ply_file_path": "sparse.ply", **split, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(transforms, indent=1) + "\n", encoding="utf-8")

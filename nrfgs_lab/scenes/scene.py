@@ -38,10 +38,8 @@ class Scene:
     ambient: Ambient
     floor: Floor
     sky: Sky
-    noises: tuple[Waves, ...]
-    """One noise for each surface: sky, ground, objects in order."""
-    floor_finish: Finish | None = None
-    """None: perfectly diffuse."""
+    noises: tuple[Waves, ...]  # One noise for each surface: sky, ground, objects in order.
+    floor_finish: Finish | None = None  # None: perfectly diffuse.
     shadow_softness: float = 0.35
 
     def first_hit(self, origins: Array, directions: Array) -> tuple[Array, Array]:

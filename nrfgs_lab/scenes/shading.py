@@ -30,12 +30,9 @@ from .textures import Colour
 class Finish:
     """The specular side of a material."""
 
-    f0: Colour
-    """Reflectance at normal incidence, each in [0, 1]. Coloured for metals."""
-    roughness: float
-    """GGX roughness alpha of the lobe, in (0, 1]."""
-    mirror: float
-    """Share m of the specular part that is a perfect mirror, in [0, 1]."""
+    f0: Colour  # Reflectance at normal incidence, each in [0, 1]. Coloured for metals.
+    roughness: float  # GGX roughness alpha of the lobe, in (0, 1].
+    mirror: float  # Share m of the specular part that is a perfect mirror, in [0, 1].
 
 
 @dataclass(frozen=True)

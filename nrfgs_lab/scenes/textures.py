@@ -23,12 +23,9 @@ class Waves:
     noise(p) = sum_j a_j sin(w_j . p + phi_j), amplitudes a_j proportional to 1 / |w_j|, with sum of a_j = 1.
     """
 
-    wave_vectors: Array
-    """[J, 3], radians per unit length."""
-    phases: Array
-    """[J]"""
-    amplitudes: Array
-    """[J]"""
+    wave_vectors: Array  # [J, 3], radians per unit length.
+    phases: Array  # [J]
+    amplitudes: Array  # [J]
 
     @classmethod
     def random(cls, rng: np.random.Generator, frequencies: Sequence[float], per_frequency: int = 3) -> "Waves":
@@ -75,8 +72,7 @@ class Paint:
 
     low: Colour
     high: Colour
-    repeats: Colour
-    """Fields per unit length along x, y, z; 0 leaves the axis out."""
+    repeats: Colour  # Fields per unit length along x, y, z; 0 leaves the axis out.
     steepness: float = 3.0
     grain: float = 0.25
 
@@ -96,10 +92,8 @@ class Floor:
     low: Colour = (0.07, 0.08, 0.11)
     high: Colour = (0.80, 0.73, 0.63)
     far: Colour = (0.46, 0.42, 0.40)
-    tile: float = 0.5
-    """Side of a tile, world units."""
-    reach: float = 4.0
-    """Distance at which the pattern has faded to exp(-1) of its contrast, world units."""
+    tile: float = 0.5  # Side of a tile, world units.
+    reach: float = 4.0  # Distance at which the pattern has faded to exp(-1) of its contrast, world units.
     steepness: float = 4.0
     grain: float = 0.35
 
@@ -122,8 +116,7 @@ class Sky:
 
     horizon: Colour
     zenith: Colour
-    patches: tuple[tuple[Array, Array], ...]
-    """(towards, radiance) of the lamp patches, [3] each; `towards` has unit length."""
+    patches: tuple[tuple[Array, Array], ...]  # (towards, radiance) of the lamp patches, [3] each; `towards` is unit.
     sharpness: float = 60.0
     cloud: float = 0.3
 

@@ -27,24 +27,18 @@ from nrfgs_lab.training_run import machine, parse, synchronize
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.model import initial_splats
 
-EXTENT = 2.0
-"""Side of the cube that the splats fill, in scene units; the cameras lie within [-1, 1]."""
-WARM, STEPS = 50, 200
-"""Steps before the clock starts, and on it."""
+EXTENT = 2.0  # Side of the cube that the splats fill, in scene units; the cameras lie within [-1, 1].
+WARM, STEPS = 50, 200  # Steps before the clock starts, and on it.
 
 
 @dataclass
 class Load:
     """Peak memory and images per second at a given number of splats."""
 
-    scene: Path
-    """folder of a data set in nerfstudio's layout"""
-    out: Path
-    """JSON file of the results"""
-    devices: tuple[int, ...] = (1, 2)
-    """numbers of devices"""
-    options: str = ""
-    """more options of ns-train"""
+    scene: Path  # folder of a data set in nerfstudio's layout
+    out: Path  # JSON file of the results
+    devices: tuple[int, ...] = (1, 2)  # numbers of devices
+    options: str = ""  # more options of ns-train
     device_type: Literal["cuda", "cpu"] = "cuda"
     splats: int = 4_000_000
 

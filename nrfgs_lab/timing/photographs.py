@@ -123,13 +123,11 @@ class Photographs:
     """Measure the reading of captures."""
 
     out: Path  # JSON file for the records
-    captures: tuple[str, ...] = tuple(CAPTURES)  # which of those that are made
-    data: tuple[Path, ...] = ()  # captures that are there, instead
+    data: tuple[Path, ...] = ()  # captures that are there, instead of those that are made
 
     def main(self) -> None:
         records = {folder.name: reading(folder, "") for folder in self.data}
-        for name in () if self.data else self.captures:
-            *shape, options = CAPTURES[name]
+        for name, (*shape, options) in () if self.data else CAPTURES.items():
             with TemporaryDirectory() as folder:
                 make(Path(folder, "capture"), *shape)
                 records[name] = reading(Path(folder, "capture"), options)

@@ -32,10 +32,6 @@ def scene(head: AppearanceHead, count: int = 11, dtype: torch.dtype = torch.floa
     return splats, visible, 6 * rand(len(visible), 3) - 3
 
 
-def shared_weights(module: torch.nn.Module) -> int:
-    return sum(weights.numel() for weights in module.parameters())
-
-
 def assert_same(field: Field, other: Field, visible: torch.Tensor, centers: torch.Tensor, atol: float = 2e-5) -> None:
     """Two fields look the same. By default up to float32's rounding: sums of up to 60 products of numbers of order 1 to
     10, rounded at 2^-24 each, behind slopes of at most 0.2."""

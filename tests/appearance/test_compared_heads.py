@@ -42,11 +42,6 @@ def test_degree_ramp_is_splatfactos():
         assert head.active_degree == degree
 
 
-def test_impossible_degree_is_named():
-    with pytest.raises(ValueError, match="appearance.degree is 4"):
-        ShConfig(degree=4).setup()
-
-
 # GSNB.
 
 

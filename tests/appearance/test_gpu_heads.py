@@ -23,8 +23,8 @@ def test_values_and_gradients(opacity_bound, visible, repeated):
     compare(head, twin, scene(head, 6000, visible, repeated), DEVICE_FLOAT32 * float32_tolerance())
 
 
-def rounded_limits(exact):
-    """Relative errors against the rounding twin.
+def compare_rounded(head, twin, precision, case):
+    """Hold the kernels against the twin that rounds as they do.
 
     Values: derivation in fused_interpreted.py; the card's float32 is coarser, so four times as many factors differ.
 
@@ -34,44 +34,38 @@ def rounded_limits(exact):
     half that are on: sqrt(2 * 2^-15.5) = 2^-7 of a gradient's norm if all features are as coarse, and most (the
     latents) are exact: 2^-8. Not rounding in the twin at all would leave 2^-6 (tf32) to 2^-4.6 (bf16).
     """
-    return {name: 2.0**-8 if name.startswith("d ") else 2.0**-12 for name in exact}
+    from nrfgs_ns.appearance.fused.launch import KINDS
+
+    exact = evaluate(rounding(twin, KINDS[precision]), *case, dtype=torch.float64)
+    assert_near(evaluate(head, *case), exact, {name: 2.0**-8 if name.startswith("d ") else 2.0**-12 for name in exact})
 
 
 @pytest.mark.parametrize("repeated", [False, True])
 @pytest.mark.parametrize("precision", ["tf32", "bf16", "fp16"])
 def test_rounded_products(precision, repeated):
-    from nrfgs_ns.appearance.fused.launch import KINDS
-
     head, twin = heads("cuda", precision=precision)
-    case = scene(head, 120_000, 100_000, repeated)
-    exact = evaluate(rounding(twin, KINDS[precision]), *case, dtype=torch.float64)
-    assert_near(evaluate(head, *case), exact, rounded_limits(exact))
+    compare_rounded(head, twin, precision, scene(head, 120_000, 100_000, repeated))
 
 
 @pytest.mark.parametrize("way", [0, 1])
 @pytest.mark.parametrize("repeated", [False, True])
-@pytest.mark.parametrize(
-    "config",
-    [
-        {"num_bands": 1, "latent_dim": 1, "hidden_width": 5},
-        {"num_bands": 2, "latent_dim": 7, "hidden_width": 20},
-        {"num_bands": 5, "latent_dim": 33, "hidden_width": 64},
-        {"num_bands": 7, "latent_dim": 64, "hidden_width": 30},
-        {"hidden_width": 128},
-        {"num_bands": 1, "latent_dim": 16, "hidden_width": 256, "split_bands": False},
-        {"split_bands": False, "opacity_residual": False},
-        {"opacity_bound": "logit", "use_distance": False},
-    ],
-)
+@pytest.mark.parametrize("config", [
+    {"num_bands": 1, "latent_dim": 1, "hidden_width": 5},
+    {"num_bands": 2, "latent_dim": 7, "hidden_width": 20},
+    {"num_bands": 5, "latent_dim": 33, "hidden_width": 64},
+    {"num_bands": 7, "latent_dim": 64, "hidden_width": 30},
+    {"hidden_width": 128},
+    {"num_bands": 1, "latent_dim": 16, "hidden_width": 256, "split_bands": False},
+    {"split_bands": False, "opacity_residual": False},
+    {"opacity_bound": "logit", "use_distance": False},
+])  # fmt: skip
 def test_sizes_and_ways(config, repeated, way, monkeypatch):
     """Every size that the kernels take, launched in the first way and in the one for small cards."""
     from nrfgs_ns.appearance.fused import launch
 
     monkeypatch.setitem(launch.LAUNCHES, "bf16", launch.LAUNCHES["bf16"][way:])
     head, twin = heads("cuda", precision="bf16", **config)
-    case = scene(head, 6000, 5000, repeated)
-    exact = evaluate(rounding(twin, launch.KINDS["bf16"]), *case, dtype=torch.float64)
-    assert_near(evaluate(head, *case), exact, rounded_limits(exact))
+    compare_rounded(head, twin, "bf16", scene(head, 6000, 5000, repeated))
 
 
 @pytest.mark.parametrize("precision", ["fp32", "tf32", "bf16", "fp16"])

@@ -5,11 +5,12 @@ import pytest
 import torch
 from fused_cases import heads
 from fused_cases import scene as fused_scene
-from head_cases import awake, scene, shared_weights
+from head_cases import awake, scene
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.head import SH_C0
 from nrfgs_ns.appearance.nrf import NrfConfig, bounded_opacity
+from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.errors import InputError
 
 
@@ -37,9 +38,9 @@ def by_hand(head, splats, visible, centers):
     return torch.stack(colors), torch.cat(opacities)
 
 
-def test_paper_counts():
-    assert shared_weights(NrfConfig().setup()) == 6664
-    assert shared_weights(NrfConfig(split_bands=False).setup()) == 8068
+@pytest.mark.parametrize("split_bands, count", [(True, 6664), (False, 8068)])
+def test_paper_counts(split_bands, count):
+    assert sum(weights.numel() for weights in NrfConfig(split_bands=split_bands).setup().parameters()) == count
 
 
 def test_matches_the_formulas():
@@ -94,11 +95,11 @@ def test_straight_through_is_a_clamp_whose_gradient_ignores_it_and_logit_the_res
 
 
 @pytest.mark.parametrize(
-    "field, value", [("num_bands", 0), ("latent_dim", 0), ("color_scale", -0.1), ("precision", "fp8")]
+    "field, value", [("num_bands", 0), ("latent_dim", 0), ("color_scale", -0.1), ("precision", "fp8"), ("degree", 4)]
 )
 def test_impossible_settings_are_named(field, value):
     with pytest.raises(ValueError, match=f"appearance.{field} is {value!r}"):
-        NrfConfig(**{field: value}).setup()
+        (ShConfig if field == "degree" else NrfConfig)(**{field: value}).setup()
 
 
 # When the fused kernels are chosen; fused_interpreted.py tests them.

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from scipy.spatial.transform import Rotation
-from short_trainings import command_line, set_up
+from short_trainings import command_line
 from torch.nn import Parameter
 
 from nrfgs_ns.densification import STRATEGIES as CONFIGS
@@ -50,11 +50,12 @@ class Table:
     def set_opacity(self, row: int, opacity: float) -> None:
         self.splats["opacities"].data[row] = logit(opacity)
 
-    def info(self, gradient: float = 0.0) -> dict:
+    def info(self, gradient: float | torch.Tensor = 0.0, absgrad: torch.Tensor | None = None) -> dict:
         """A 100 x 100 picture that shows every splat, each with this gradient along x in units of half the picture."""
         means2d = torch.zeros(len(self), 2, requires_grad=True)
-        means2d.grad = torch.tensor([gradient / 50.0, 0.0]).repeat(len(self), 1)
-        means2d.absgrad = means2d.grad.clone()
+        along_x = torch.as_tensor(gradient).expand(len(self)) / 50.0
+        means2d.grad = torch.stack([along_x, torch.zeros_like(along_x)], dim=1)
+        means2d.absgrad = means2d.grad.clone() if absgrad is None else absgrad
         means2d.retain_grad = lambda: None
         rows = {"gaussian_ids": torch.arange(len(self)), "radii": torch.ones(len(self), dtype=torch.int32)}
         return {"means2d": means2d, **rows, "width": 100, "height": 100, "n_cameras": 1}
@@ -63,17 +64,19 @@ class Table:
         self,
         strategy,
         step: int,
-        gradient: float = 0.0,
-        shown: float | Callable[[torch.Tensor], torch.Tensor] = 0.5,
+        gradient: float | torch.Tensor = 0.0,
+        shown: float | torch.Tensor | Callable[[torch.Tensor], torch.Tensor] = 0.5,
         seen: slice | torch.Tensor = slice(None),
+        absgrad: torch.Tensor | None = None,
+        **changed: torch.Tensor,
     ) -> None:
         """One training step; the splats in `seen` have the effective opacity `shown`, or what it makes of the stored
-        ones, which it is given as heads compute them."""
-        info = self.info(gradient)
+        ones, which it is given as heads compute them. `changed` are other entries of `info`."""
+        info = self.info(gradient, absgrad) | changed
         rows = info["gaussian_ids"][seen]
         logits = self.splats["opacities"]
         stored = torch.sigmoid(logits.detach().index_select(0, rows)).squeeze(-1)
-        opacities = shown(stored) if callable(shown) else torch.full_like(stored, shown)
+        opacities = shown(stored) if callable(shown) else torch.as_tensor(shown).expand_as(stored)
         view = {**info, "gaussian_ids": rows, "radii": info["radii"][rows]}
         strategy.pre_backward(step, view, opacities, logits)
         if "change" in view:
@@ -112,10 +115,6 @@ def arguments(scene: Path, out: Path, densification: str, steps: int = 20, **rul
         "--pipeline.model.few-views": "off",
     }
     return command_line("nrfgs", scene, out, steps, options)
-
-
-def trainer_of(scene: Path, out: Path, densification: str, **rules):
-    return set_up(arguments(scene, out, densification, **rules))
 
 
 def one_step(trainer, step: int) -> dict:

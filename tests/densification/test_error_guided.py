@@ -23,15 +23,6 @@ def rules(**options):
     return strategy
 
 
-def refine(table: Table, strategy, step: int = 600, gradient: float = 0.0, shown=0.5, absgrad=None, **changed) -> None:
-    """One step. `shown` is the opacity of all splats or of each, and `changed` are other entries of `info`."""
-    info = table.info(gradient) | changed
-    if absgrad is not None:
-        info["means2d"].absgrad = absgrad
-    strategy.pre_backward(step, info, torch.as_tensor(shown).expand(len(table)), table.splats["opacities"])
-    strategy.post_backward(step, info, table.splats, table.optimizers)
-
-
 def errors(size: int, scale: float = 1.0, views: int = 2, cameras_at_once: bool = False) -> torch.Tensor:
     """The statistic of twelve splats after so many views of `size` pixels of a scene that is `scale` times as large."""
     generator = torch.Generator().manual_seed(3)
@@ -137,7 +128,7 @@ def test_a_share_of_the_candidates_is_split_and_the_dead_are_replaced():
     for row in range(4):
         table.set_opacity(row, 0.001)
     stored = torch.sigmoid(table.splats["opacities"].detach()).flatten()
-    refine(table, strategy, shown=stored, absgrad=(torch.arange(40) >= 20).float()[:, None].repeat(1, 2))
+    table.step(strategy, 600, shown=stored, absgrad=(torch.arange(40) >= 20).float()[:, None].repeat(1, 2))
     table.check()
     assert len(table) == 40 + round(SHARE * 20) - 4
     assert set(table.splats["latents"][:4, 0].long().tolist()) <= set(range(4, 40))
@@ -152,14 +143,14 @@ def test_the_shown_opacity_decides_what_is_dead():
     shown = torch.full((10,), 0.3)
     shown[4:] = 0.001
     shown[9] = 0.9
-    refine(table, strategy, shown=shown)
+    table.step(strategy, 600, shown=shown)
     assert table.splats["latents"][:4, 0].long().tolist() == [0, 1, 2, 3]
     assert set(table.splats["latents"][:, 0].long().tolist()) <= {0, 1, 2, 3, 9}
 
 
 def test_wide_splats_are_split_whatever_their_error():
     table, strategy = Table(10), rules(threshold=10.0)
-    refine(table, strategy, radii=torch.where(torch.arange(10) == 7, 80, 1))
+    table.step(strategy, 600, radii=torch.where(torch.arange(10) == 7, 80, 1))
     assert len(table) == 11
     assert table.splats["latents"][10, 0] == 7 and table.splats["scales"][7, 0].exp().item() < 0.001
 
@@ -170,7 +161,7 @@ def test_a_budget_decides_how_many_splats_there_are_when_growth_ends(budget):
     table, strategy = Table(40), rules(budget=budget)
     counts = []
     for step in range(0, 16_000, 200):
-        refine(table, strategy, step, absgrad=torch.rand(len(table), 2) * 1e-6)
+        table.step(strategy, step, absgrad=torch.rand(len(table), 2) * 1e-6)
         counts.append(len(table))
     assert counts == sorted(counts)
     assert counts[-1] == max(budget, 40)
@@ -181,7 +172,7 @@ def test_opacities_decay_less_and_less():
     for step in (600, 15_000, 24_800):
         table, strategy = Table(5), rules()
         strategy.state[WIDTH] = torch.full((5,), 0.5)
-        refine(table, strategy, step)
+        table.step(strategy, step)
         taken.append(0.5 - torch.sigmoid(table.splats["opacities"][0]).item())
     assert taken == pytest.approx([DECAY * (1 - step / 30_000) for step in (600, 15_000, 24_800)], abs=1e-6)
 
@@ -191,7 +182,7 @@ def test_growth_ends_at_the_cap_and_in_time():
         ErrorGuided(budget=50, most_splats=40).check()
     for step, options, count in ((600, {"most_splats": 43}, 43), (15_000, {}, 40), (25_000, {}, 40)):
         table, strategy = Table(40), rules(**options)
-        refine(table, strategy, step, gradient=1.0)
+        table.step(strategy, step, gradient=1.0)
         assert len(table) == count
 
 

@@ -129,11 +129,7 @@ def test_the_largest_gradients_grow(name, monkeypatch):
     """Splats that are wide in the image, but not by gradient, do not."""
     monkeypatch.setattr(memory, "most_splats", lambda *_: 43)
     table, rules = Table(40), strategy(name)
-    info = table.info(1.0)
-    info["means2d"].absgrad = info["means2d"].grad = info["means2d"].grad * torch.arange(40)[:, None]
-    info["radii"][:20] = 9
-    rules.pre_backward(REFINES, info, torch.full((40,), 0.5), table.splats["opacities"])
-    rules.post_backward(REFINES, info, table.splats, table.optimizers)
+    table.step(rules, REFINES, torch.arange(40.0), radii=torch.where(torch.arange(40) < 20, 9, 1))
     table.check()
     latents = table.splats["latents"][:, 0].round().sort().values.tolist()
     assert latents == sorted([*range(40), 37, 38, 39])

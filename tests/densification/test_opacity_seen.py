@@ -3,7 +3,8 @@
 
 import pytest
 import torch
-from densification_cases import REFINES, STRATEGIES, Table, one_step, strategy, trainer_of
+from densification_cases import REFINES, STRATEGIES, Table, arguments, one_step, strategy
+from short_trainings import set_up
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.gsnb import GsnbConfig
@@ -207,7 +208,7 @@ def test_the_peak_is_forgotten_at_reset():
 
 
 def test_the_peak_is_that_of_the_head(tiny_scene, tmp_path):
-    trainer = trainer_of(tiny_scene, tmp_path, "splatfacto", opacity_seen="peak")
+    trainer = set_up(arguments(tiny_scene, tmp_path, "splatfacto", opacity_seen="peak"))
     model = trainer.pipeline.model
     model.head.low[-1].bias.data[3] = 100.0  # d_alpha = 0.2 tanh(100) = 0.2
     one_step(trainer, 1)  # at step 0 splatfacto resets

@@ -1,13 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Densification in a training: the losses that it adds, and that a continued training cannot tell."""
 
-from pathlib import Path
-
 import pytest
-from densification_cases import arguments, trainer_of
-from short_trainings import assert_same_training, checkpoint_of, models_of, set_up
+from densification_cases import arguments
+from short_trainings import assert_same_training, checkpoint_of, models_of, set_up, trained
 
-from nrfgs_lab.training_run import train
 from nrfgs_ns.densification import CHANGE, UNSEEN, memory
 from nrfgs_ns.densification.strategy import HELD
 from nrfgs_ns.errors import InputError
@@ -16,7 +13,7 @@ pytestmark = pytest.mark.usefixtures("no_cuda")
 
 
 def test_mcmc_regularises_the_loss_in_training_only(tiny_scene, tmp_path):
-    trainer = trainer_of(tiny_scene, tmp_path, "mcmc")
+    trainer = set_up(arguments(tiny_scene, tmp_path, "mcmc"))
     model = trainer.pipeline.model
     camera, batch = trainer.pipeline.datamanager.next_train(0)
     model.step_cb(trainer.optimizers, 0)
@@ -28,31 +25,34 @@ def test_mcmc_regularises_the_loss_in_training_only(tiny_scene, tmp_path):
 
 
 def test_the_extent_is_that_of_the_training_cameras(tiny_scene, tmp_path):
-    trainer = trainer_of(tiny_scene, tmp_path, "original")
+    trainer = set_up(arguments(tiny_scene, tmp_path, "original"))
     centers = trainer.pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]
     expected = 1.1 * (centers - centers.mean(0)).norm(dim=1).max().item()
     assert trainer.pipeline.model.densification.state["scene_scale"] == pytest.approx(expected)
 
 
+@pytest.fixture
+def run(tiny_scene, tmp_path):
+    """A function: the last checkpoint of a training by a strategy, and the checkpoints' folder."""
+
+    def run(name: str, densification: str, steps: int, load: dict | None = None, **rules) -> dict:
+        args = arguments(tiny_scene, tmp_path / name, densification, steps, **rules)
+        config = trained([*args, *(["--load-dir", load["folder"]] if load else [])])
+        return checkpoint_of(config) | {"folder": str(models_of(config))}
+
+    return run
+
+
 @pytest.mark.parametrize(
     "densification, seen", [("splatfacto", "peak"), ("original", "base"), ("mcmc", "peak"), ("error-guided", "peak")]
 )
-def test_resumed_training_is_the_unbroken_one(densification, seen, tiny_scene, tmp_path):
-    """26 steps at once, against 14 and 12 more: the checkpoint lies between two refinements, with statistics in flight.
-
-    The same machine adds the same numbers in the same order, so that only a lost state can differ.
-    """
+def test_resumed_training_is_the_unbroken_one(densification, seen, run):
+    """26 steps at once, and 14 and 12 more: the checkpoint lies between two refinements, with statistics in flight."""
     rules = {"opacity_seen": seen}
     if densification == "mcmc":
         rules["budget"] = 330  # from 300: growth of 5 % at steps 4, 8, ... reaches it in the first half
-
-    def run(name: str, steps: int, *more: str) -> dict:
-        args = arguments(tiny_scene, tmp_path / name, densification, steps, **rules)
-        config = Path(train([*args, *more]).config_path)
-        return checkpoint_of(config) | {"folder": models_of(config)}
-
-    whole, half = run("whole", 26), run("half", 14)
-    rest = run("rest", 26, "--load-dir", str(half["folder"]))
+    whole, half = (run(name, densification, steps, **rules) for name, steps in (("whole", 26), ("half", 14)))
+    rest = run("rest", densification, 26, half, **rules)
     assert whole["step"] == rest["step"] == 25
     counts = [len(part["pipeline"]["_model.gauss_params.means"]) for part in (half, whole)]
     if densification == "mcmc":
@@ -67,24 +67,17 @@ def test_resumed_training_is_the_unbroken_one(densification, seen, tiny_scene, t
 
 
 @pytest.mark.parametrize("densification", ["splatfacto", "mcmc", "error-guided"])
-def test_growth_that_memory_holds_is_held_in_a_continued_training(densification, tiny_scene, tmp_path, monkeypatch):
+def test_growth_that_memory_holds_is_held_in_a_continued_training(densification, run, monkeypatch):
     """Whatever memory there seems to be then: it is measured otherwise in another process."""
     measured = iter([310])
     monkeypatch.setattr(memory, "most_splats", lambda *_: next(measured, 10**6))
-
-    def run(name: str, steps: int, *more: str) -> dict:
-        config = Path(train([*arguments(tiny_scene, tmp_path / name, densification, steps), *more]).config_path)
-        return checkpoint_of(config) | {"folder": models_of(config)}
-
-    half = run("half", 14)
-    rest, measured = run("rest", 26, "--load-dir", str(half["folder"])), iter([310])
-    assert_same_training(run("whole", 26), rest, rtol=0, atol=0)
+    half = run("half", densification, 14)
+    rest, measured = run("rest", densification, 26, half), iter([310])
+    assert_same_training(run("whole", densification, 26), rest, rtol=0, atol=0)
     assert 300 <= len(rest["pipeline"]["_model.gauss_params.means"]) <= 310
     assert rest["pipeline"]["_model._extra_state"]["strategy"][HELD] == (310, 0)
 
 
-def test_another_strategies_checkpoint_is_refused(tiny_scene, tmp_path):
-    config = Path(train(arguments(tiny_scene, tmp_path / "a", "original", steps=1)).config_path)
-    more = ["--load-dir", str(config.parent / "nerfstudio_models")]
+def test_another_strategies_checkpoint_is_refused(run):
     with pytest.raises(InputError, match="densification original"):
-        set_up([*arguments(tiny_scene, tmp_path / "b", "mcmc"), *more])
+        run("b", "mcmc", 20, run("a", "original", 1))

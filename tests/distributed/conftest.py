@@ -39,10 +39,10 @@ def session_of_its_own():
     return session
 
 
-def meet(job: str, scene: Path, folder: Path, world: int = 2, device_type: str = "cpu") -> Path:
-    """Run a job of `jobs.py` on `world` processes; `folder`, into which they save their results."""
+def meet(job: str, scene: Path, folder: Path, device_type: str = "cpu") -> Path:
+    """Run a job of `jobs.py` on two processes; `folder`, into which they save their results."""
     folder.mkdir(parents=True, exist_ok=True)
-    with session(DEVICE, job, world, scene, folder, device_type) as process:
+    with session(DEVICE, job, 2, scene, folder, device_type) as process:
         said, _ = process.communicate(timeout=TIMEOUT)
     assert process.returncode == 0, said[-6000:]
     return folder
@@ -63,10 +63,6 @@ def two_devices(tiny_scene, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def run_together(tmp_path_factory, tiny_scene):
-    """Run another job: name, processes, device type -> folder of its results."""
-
-    def run(job: str, world: int = 2, device_type: str = "cpu") -> Path:
-        return meet(job, tiny_scene, tmp_path_factory.mktemp(job) / "devices", world, device_type)
-
-    return run
+def on_gpus(tiny_scene, tmp_path_factory) -> Path:
+    """The results of `jobs.fits_one_process` on two GPUs with NCCL between them."""
+    return meet("fits_one_process", tiny_scene, tmp_path_factory.mktemp("two-gpus") / "devices", "cuda")

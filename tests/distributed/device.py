@@ -61,16 +61,16 @@ def precise(trainer) -> None:
         data.train_cameras.width[index], data.train_cameras.height[index] = 40, 30
 
 
-def one_step(options: dict, scene: Path, folder: Path, name: str) -> None:
-    """A step on two devices, and, on the main one, the same step by one process; all in float64."""
+def one_step(options: dict, scene: Path, folder: Path, name: str, prepare=precise) -> None:
+    """A step on two devices, and, on the main one, the same step by one process; by default all in float64."""
     rank, world = dist.get_rank(), dist.get_world_size()
     trainer = trainer_of(scene, folder / name, world, **options)
-    precise(trainer)
+    prepare(trainer)
     torch.save(step_together(trainer), folder / f"{name}-{rank}.pt")
     torch.set_default_dtype(torch.float32)
     if rank == 0:
         trainer = trainer_of(scene, folder / f"{name}-alone", 1, **options)
-        precise(trainer)
+        prepare(trainer)
         cameras, _ = trainer.pipeline.datamanager.next_train_views(world, 0)
         torch.save(step_alone(trainer, cameras), folder / f"{name}-alone.pt")
         torch.set_default_dtype(torch.float32)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 import torch.distributed as dist
-from device import BY_ERROR, PEAK, PIXELS, PLAIN, RICH, one_step, step_alone, step_together, told, train, trainer_of
+from device import BY_ERROR, PEAK, PIXELS, PLAIN, RICH, one_step, told, train, trainer_of
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
 
@@ -96,13 +96,7 @@ def holds(trainer) -> dict:
 
 def fits_one_process(scene: Path, folder: Path) -> None:
     """Device 0's image and loss in the first step, and those of one process; in the devices' own precision."""
-    world = dist.get_world_size()
-    torch.save(step_together(trainer_of(scene, folder / "step", world, **PLAIN)), folder / f"step-{dist.get_rank()}.pt")
-    if dist.get_rank() == 0:
-        alone = trainer_of(scene, folder / "alone", 1, **PLAIN)
-        cameras, _ = alone.pipeline.datamanager.next_train_views(world, 0)
-        torch.save(step_alone(alone, cameras), folder / "step-alone.pt")
-    dist.barrier()
+    one_step(PLAIN, scene, folder, "step", prepare=lambda trainer: None)
     fifty_steps(scene, folder)
 
 

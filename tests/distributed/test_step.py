@@ -20,8 +20,8 @@ from nrfgs_ns.distributed.shards import rows_of, shard_counts, transfers
 RELATIVE = 1e-8
 
 
-def agree(name, ours, theirs) -> None:
-    assert_close(ours, theirs, rtol=0.0, atol=RELATIVE * float(theirs.abs().max()), msg=lambda text: f"{name}: {text}")
+def agree(name, ours, theirs, relative: float = RELATIVE) -> None:
+    assert_close(ours, theirs, rtol=0.0, atol=relative * float(theirs.abs().max()), msg=lambda text: f"{name}: {text}")
 
 
 @pytest.fixture(params=["plain", "rich", "pixels"])
@@ -125,29 +125,19 @@ Cancellation makes sizes larger than sums, for which 25 is allowed. A gradient t
 by 0.5."""
 
 
-@pytest.fixture(scope="module")
-def on_gpus(run_together):
-    return run_together("fits_one_process", device_type="cuda")
-
-
 @gpus
 def test_step_on_gpus(on_gpus):
     first, second, alone = (torch.load(on_gpus / f"step-{who}.pt", map_location="cpu") for who in (0, 1, "alone"))
     for rank, ours in enumerate((first, second)):
-        nearly("rgb", ours["rgb"], alone["rgb"][rank])
+        agree("rgb", ours["rgb"], alone["rgb"][rank], TOLERANCE)
         for name, theirs in alone["gradients"].items():
             if name != "quats":  # the first splats are round: their rotation has no gradient
-                nearly(name, ours["gradients"][name], theirs[rank::2])
+                agree(name, ours["gradients"][name], theirs[rank::2], TOLERANCE)
         for name, theirs in alone["shared"].items():
             if theirs is not None:
-                nearly(name, ours["shared"][name], theirs)
+                agree(name, ours["shared"][name], theirs, TOLERANCE)
         for name, theirs in alone["statistics"].items():
-            nearly(name, ours["statistics"][name], theirs[rank::2])
-
-
-def nearly(name, ours, theirs) -> None:
-    bound = TOLERANCE * float(theirs.abs().max())
-    assert_close(ours, theirs, rtol=0.0, atol=bound, msg=lambda text: f"{name}: {text}")
+            agree(name, ours["statistics"][name], theirs[rank::2], TOLERANCE)
 
 
 @gpus

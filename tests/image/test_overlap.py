@@ -21,10 +21,6 @@ def wall(count: int = 3000, seed: int = 0):
     return torch.cat([torch.rand(count, 2, generator=generator) * 4 - 2, torch.zeros(count, 1)], dim=1)
 
 
-def painted(x, y):
-    return 0.4 + 0.2 * torch.stack([torch.sin(2 * x), torch.cos(1.5 * y), torch.sin(x + y)], dim=-1)
-
-
 def photographs(stops, gloss: float = 0.0):
     """Views of the wall from 3 away, each a little to the right of the one before, with these stops [V, 3].
     With gloss, a light that is brightest to the right of the camera adds stops, other ones in each place."""
@@ -34,7 +30,8 @@ def photographs(stops, gloss: float = 0.0):
     for own, offset in zip(stops, places(len(stops))[:, 0], strict=True):
         x, y = (column - WIDTH / 2) / FOCAL * 3 + offset, (row - HEIGHT / 2) / FOCAL * 3
         light = own + gloss * torch.sin(25 * (x - 3 * offset))[..., None]
-        channels = zip(painted(x, y).split(1, dim=-1), light.split(1, dim=-1), strict=True)
+        paint = 0.4 + 0.2 * torch.stack([torch.sin(2 * x), torch.cos(1.5 * y), torch.sin(x + y)], dim=-1)
+        channels = zip(paint.split(1, dim=-1), light.split(1, dim=-1), strict=True)
         images.append(torch.cat([exposed(color, stop) for color, stop in channels], dim=-1))
     return viewmats, images
 

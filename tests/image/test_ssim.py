@@ -17,6 +17,12 @@ DOUBLE_TOLERANCE = TOLERANCE * 2.0**-29
 """The same bound for float64's 2^-53 instead of 2^-24."""
 
 
+@pytest.fixture(autouse=True)
+def kernels_run(request):
+    if request.node.get_closest_marker("gpu"):
+        assert module.kernels_run_on(torch.device("cuda", torch.cuda.current_device()))
+
+
 @settings(max_examples=40, derandomize=True)
 @given(st.integers(11, 40), st.integers(11, 40), st.sampled_from([0.0, 0.2, 1.0]), st.integers(0, 9))
 def test_values_and_gradients_in_float64(height, width, ssim_lambda, seed):
@@ -73,21 +79,17 @@ def test_small_images_are_the_librarys(size):
     assert (torch.autograd.grad(loss, prediction)[0] - gradient).abs().max() <= FLAT * gradient.abs().max()
 
 
-def test_not_a_number_is_seen():
-    prediction, truth = pair(20, 20)
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+@pytest.mark.parametrize(("size", "place"), [(20, (10, 10, 1)), (50, (49, 49, 2))])
+def test_not_a_number_is_seen(size, place, device):
+    prediction, truth = pair(size, size, device=device)
     broken = prediction.detach().clone()
-    broken[10, 10, 1] = float("nan")
+    broken[place] = float("nan")
     assert photometric_loss(broken, truth, 0.2).isnan()
 
 
 # The kernels on a CUDA device. `pytest -m gpu`.
-@pytest.fixture
-def kernels_run():
-    assert module.kernels_run_on(torch.device("cuda", torch.cuda.current_device()))
-
-
 @pytest.mark.gpu
-@pytest.mark.usefixtures("kernels_run")
 @pytest.mark.parametrize("ssim_lambda", [0.0, 0.2, 1.0])
 @pytest.mark.parametrize("size", [(11, 11), (12, 43), (33, 11), (97, 128), (532, 799), (1200, 1600)])
 def test_values_and_gradients_on_a_gpu(size, ssim_lambda):
@@ -98,7 +100,6 @@ def test_values_and_gradients_on_a_gpu(size, ssim_lambda):
 
 
 @pytest.mark.gpu
-@pytest.mark.usefixtures("kernels_run")
 @pytest.mark.parametrize("value", [0.0, 0.9, 1.0])
 def test_nearly_flat_images(value):
     generator = torch.Generator().manual_seed(3)
@@ -115,7 +116,6 @@ def test_nearly_flat_images(value):
 
 
 @pytest.mark.gpu
-@pytest.mark.usefixtures("kernels_run")
 def test_twice_is_the_same():
     prediction, truth = pair(270, 333, device="cuda")
     losses = [photometric_loss(prediction, truth, 0.2) for _ in range(2)]
@@ -125,19 +125,9 @@ def test_twice_is_the_same():
 
 
 @pytest.mark.gpu
-@pytest.mark.usefixtures("kernels_run")
 def test_images_that_are_not_contiguous_and_upstream_gradients():
     prediction, truth = pair(40, 57, device="cuda")
     turned = prediction.transpose(0, 1)
     (1000.0 * photometric_loss(turned, truth.transpose(0, 1), 0.2)).backward()
     _, gradient = reference(prediction, truth, 0.2)
     assert (prediction.grad / 1000.0 - gradient).abs().max() <= TOLERANCE * gradient.abs().max()
-
-
-@pytest.mark.gpu
-@pytest.mark.usefixtures("kernels_run")
-def test_not_a_number_is_seen_on_a_gpu():
-    prediction, truth = pair(50, 50, device="cuda")
-    broken = prediction.detach().clone()
-    broken[49, 49, 2] = float("nan")
-    assert photometric_loss(broken, truth, 0.2).isnan()

@@ -13,16 +13,7 @@ from nrfgs_lab.training_run import evaluate, parse
 from nrfgs_ns.export.command import Compact, Ply
 from nrfgs_ns.export.options import PlyOptions
 from nrfgs_ns.export.ply import read_splats
-from nrfgs_ns.viewer.pictures import (
-    AMPLIFICATION,
-    BASE,
-    DEPTH,
-    FULL,
-    VIEW_DEPENDENCE,
-    PictureOptions,
-    legends,
-    picture,
-)
+from nrfgs_ns.viewer.pictures import AMPLIFICATION, BASE, DEPTH, FULL, VIEW_DEPENDENCE, PictureOptions, legends, picture
 
 pytestmark = pytest.mark.gpu
 FROZEN = "full, as seen from another camera"

@@ -56,29 +56,23 @@ def test_the_second_launch_is_the_compiled_variants_with_constants_in_the_kernel
     ]
 
 
-@pytest.mark.parametrize(
-    "arguments, constants",
-    [
-        ((torch.zeros(9)[1:], 8, 0.5), {}),  # 4 bytes into an allocation
-        ((torch.zeros(8), 2**31, 0.5), {}),
-        ((torch.zeros(8), 8, 1), {}),  # an integer where others had a float
-        ((torch.zeros(8), 8, 0.5), {"B": 128}),
-        ((torch.zeros(8), 8, 0.5), {"num_warps": 8}),
-    ],
-    ids=["unaligned", "64 bits", "another type", "another constant", "another option"],
-)
+@pytest.mark.parametrize("arguments, constants", [
+    ((torch.zeros(9)[1:], 8, 0.5), {}),  # 4 bytes into an allocation
+    ((torch.zeros(8), 2**31, 0.5), {}),
+    ((torch.zeros(8), 8, 1), {}),  # an integer where others had a float
+    ((torch.zeros(8), 8, 0.5), {"B": 128}),
+    ((torch.zeros(8), 8, 0.5), {"num_warps": 8}),
+], ids=["unaligned", "64 bits", "another type", "another constant", "another option"])  # fmt: skip
 def test_what_asks_for_another_variant_goes_to_triton(arguments, constants):
+    ordinary, other = ((torch.zeros(8), 8, 0.5), CONSTANTS), (arguments, CONSTANTS | constants)
     for order, expected in (
-        ("ordinary other ordinary", ["triton", "triton", "compiled"]),
-        ("other ordinary", ["triton", "triton"]),
+        ((ordinary, other, ordinary), ["triton", "triton", "compiled"]),
+        ((other, ordinary), ["triton", "triton"]),
     ):
         kernel = Kernel()
         launch = Launcher(kernel)
-        for name in order.split():
-            if name == "ordinary":
-                launch((1, 1, 1), torch.zeros(8), 8, 0.5, **CONSTANTS)
-            else:
-                launch((1, 1, 1), *arguments, **{**CONSTANTS, **constants})
+        for words, named in order:
+            launch((1, 1, 1), *words, **named)
         assert [kind for kind, *_ in kernel.launches] == expected
 
 

@@ -49,21 +49,12 @@ def build(tiny_scene, tmp_path):
     return pipeline
 
 
-def begin_step(model, step: int) -> None:
-    """What the trainer does before a step."""
-    model.step_cb(Optimizers({}, {}), step)
-
-
-def first_view(pipeline):
-    return pipeline.datamanager.fixed_indices_eval_dataloader[0]
-
-
 def test_the_head_sees_only_what_the_camera_sees(build, monkeypatch):
     pipeline = build()
     model = pipeline.model.eval()
     rows, forward = [], model.head.forward
     monkeypatch.setattr(model.head, "forward", lambda *args: rows.append(args[1]) or forward(*args))
-    camera, _ = first_view(pipeline)
+    camera, _ = pipeline.datamanager.fixed_indices_eval_dataloader[0]
     model.get_outputs_for_camera(camera)
     to_camera = world_to_camera(camera.camera_to_worlds)[0]
     z = model.means.detach() @ to_camera[2, :3] + to_camera[2, 3]
@@ -75,7 +66,7 @@ def test_the_head_sees_only_what_the_camera_sees(build, monkeypatch):
 def test_crop_keeps_what_is_inside(build):
     pipeline = build()
     pipeline.eval()
-    model, (camera, _) = pipeline.model, first_view(pipeline)
+    model, (camera, _) = pipeline.model, pipeline.datamanager.fixed_indices_eval_dataloader[0]
     centre = model.means.detach().mean(dim=0)
     size = model.means.detach().std(dim=0)
     everything = OrientedBox.from_params(tuple(centre.tolist()), (0.0, 0.0, 0.0), (1e3, 1e3, 1e3))
@@ -116,10 +107,10 @@ def test_metrics_count_only_what_is_inside_the_mask(build, masked_scene, tiny_sc
     masked, plain = build(data=masked_scene), build(data=tiny_scene)
     for pipeline in (masked, plain):
         pipeline.eval()
-    camera, batch = first_view(masked)
+    camera, batch = masked.datamanager.fixed_indices_eval_dataloader[0]
     outputs = masked.model.get_outputs_for_camera(camera)
     metrics, _ = masked.model.get_image_metrics_and_images(outputs, batch)
-    truth = first_view(plain)[1]["image"].float() / 255
+    truth = plain.datamanager.fixed_indices_eval_dataloader[0][1]["image"].float() / 255
     inside = (outputs["rgb"] - truth)[:, 16:]
     assert metrics["psnr"] == pytest.approx(-10 * math.log10(inside.square().mean()), abs=1e-3)
     assert metrics["l1"] == pytest.approx(inside.abs().mean().item(), abs=1e-5)
@@ -129,7 +120,7 @@ def test_metrics_count_only_what_is_inside_the_mask(build, masked_scene, tiny_sc
 def test_training_resolution_follows_the_schedule(build):
     pipeline = build()
     for step, size in ((0, (9, 12)), (3000, (18, 24)), (6000, (36, 48))):
-        begin_step(pipeline.model, step)
+        pipeline.model.step_cb(Optimizers({}, {}), step)
         camera, batch = pipeline.datamanager.next_train(step)
         outputs = pipeline.model(camera)
         assert tuple(outputs["rgb"].shape[:2]) == size
@@ -186,7 +177,7 @@ def test_few_or_duplicate_points_start_finite(build, count):
 def test_gradients_reach_every_parameter(build, method, mode):
     pipeline = build(method, "--pipeline.model.rasterize-mode", mode)
     model = pipeline.model
-    begin_step(model, 10**6)
+    model.step_cb(Optimizers({}, {}), 10**6)
     if method == "nrfgs":  # zero output layers would let nothing through to the layers before them
         for branch in (model.head.low, model.head.high):
             torch.nn.init.normal_(branch[-1].weight, std=0.1)

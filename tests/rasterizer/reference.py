@@ -26,53 +26,30 @@ and their products then lose roundings of HELD and of HELD^2, however near a pix
 class Screen:
     """N splats seen by one camera; rows of invisible splats are meaningless. float64"""
 
-    means2d: Tensor
-    """[N, 2]"""
-    depths: Tensor
-    """[N]"""
-    conics: Tensor
-    """Inverse of the blurred covariance. [N, 2, 2]"""
-    compensations: Tensor
-    """sqrt(det / det_blurred). [N]"""
-    condition: Tensor
-    """(a c / det) of the covariance before the blur: by how much a difference of products amplifies rounding in det.
-    [N]
-    """
-    reach: Tensor
-    """Half the sides of the splat's rectangle before they are rounded up. [N, 2]"""
-    visible: Tensor
-    """[N], bool"""
+    means2d: Tensor  # [N, 2]
+    depths: Tensor  # [N]
+    conics: Tensor  # [N, 2, 2], inverse of the blurred covariance
+    compensations: Tensor  # [N], sqrt(det / det_blurred)
+    condition: Tensor  # [N], a c / det before the blur: by how much a difference of products amplifies rounding in det
+    reach: Tensor  # [N, 2], half the sides of the splat's rectangle before they are rounded up
+    visible: Tensor  # [N], bool
 
 
 @dataclass
 class Image:
     """One camera's image, and bounds to judge another one by. float64"""
 
-    render: Tensor
-    """[H, W, D]"""
-    alphas: Tensor
-    """[H, W, 1]"""
-    order: Tensor
-    """The n visible splats, nearest first. [n], int64"""
-    pixel_means2d: Tensor
-    """One copy of means2d[order] per pixel: absgrad is the sum over pixels of its |.grad|. [n, H, W, 2]"""
-    rounding: Tensor
-    """First-order bound of the image's rounding error per unit of colour range, for the `unit` asked for. [H, W]"""
-    undecided: Tensor
-    """Pixels where a cut-off lies within rounding error. [H, W], bool"""
-    jump: Tensor
-    """How far an undecided pixel may move per unit of colour range. [H, W]"""
+    render: Tensor  # [H, W, D]
+    alphas: Tensor  # [H, W, 1]
+    order: Tensor  # [n], int64: the n visible splats, nearest first
+    pixel_means2d: Tensor  # [n, H, W, 2], means2d[order] for each pixel: absgrad is the sum over pixels of its |.grad|
+    rounding: Tensor  # [H, W], first-order bound of the rounding error in `unit`s, per unit of colour range
+    undecided: Tensor  # [H, W], bool: pixels where a cut-off lies within rounding error
+    jump: Tensor  # [H, W], how far an undecided pixel may move per unit of colour range
 
 
 def project(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    width: int,
-    height: int,
-    *,
+    *arguments: Any,
     near_plane: float = 0.01,
     far_plane: float = 1e10,
     eps2d: float = 0.3,
@@ -86,7 +63,8 @@ def project(
         bounds: what cuts a splat off. square: of three standard deviations along its longest axis, as gsplat 1.4 does
             it. rectangle: of 3.33 along each axis of the image, as gsplat 1.5.
     """
-    means, quats, scales, viewmat, K = (t.double() for t in (means, quats, scales, viewmat, K))
+    *tables, width, height = arguments
+    means, quats, scales, viewmat, K = (t.double() for t in tables)
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     W, t = viewmat[:3, :3], viewmat[:3, 3]
 

@@ -15,22 +15,21 @@ from nrfgs_ns.training.config_file import read_config
 
 
 @pytest.fixture
-def saved(tmp_path):
-    def save(text: str) -> Path:
-        path = tmp_path / "config.yml"
-        path.write_text(text, encoding="utf-8")
-        return path
+def read(tmp_path):
+    def read(text: str):
+        (tmp_path / "config.yml").write_text(text, encoding="utf-8")
+        return read_config(tmp_path / "config.yml")
 
-    return save
+    return read
 
 
 @pytest.mark.parametrize("name", ["nrfgs_best", "nrfgs_gsnb"])
-def test_what_is_saved_is_read_back(saved, name):
+def test_what_is_saved_is_read_back(read, name):
     config = replace(getattr(method_config, name).config, data=Path("/some where/scène"))
-    assert read_config(saved(yaml.dump(config))) == config
+    assert read(yaml.dump(config)) == config
 
 
-def test_enums_as_early_versions_of_python_3_11_write_them(saved):
+def test_enums_as_early_versions_of_python_3_11_write_them(read):
     event = r"!!python/object/apply:nerfstudio.utils.writer.EventName\n(\s*)- Train Iter \(time\)"
     text, count = re.subn(
         event,
@@ -39,7 +38,7 @@ def test_enums_as_early_versions_of_python_3_11_write_them(saved):
         yaml.dump(method_config.nrfgs.config),
     )
     assert count == 1 or sys.version_info < (3, 11, 4)
-    assert read_config(saved(text)) == method_config.nrfgs.config
+    assert read(text) == method_config.nrfgs.config
 
 
 WHOLE = yaml.dump(method_config.nrfgs.config)
@@ -80,12 +79,12 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("text", HOSTILE.values(), ids=HOSTILE.keys())
-def test_a_file_that_asks_for_more_is_refused(saved, tmp_path, text):
+def test_a_file_that_asks_for_more_is_refused(read, tmp_path, text):
     mark = tmp_path / "mark"
     text = text.replace("{mark}", str(mark))
     assert text != WHOLE
     with pytest.raises(InputError, match="config.yml is not") as refused:
-        read_config(saved(text))
+        read(text)
     assert "\n" not in str(refused.value) and not mark.exists()
     if "touch" in text:  # the file is one that would have been obeyed, or would have failed for another reason
         assert "it asks for" in str(refused.value) or "could not determine a constructor" in str(refused.value)
@@ -101,11 +100,11 @@ TYPES = {
 
 
 @pytest.mark.parametrize("old", TYPES)
-def test_a_value_of_another_type_is_refused(saved, old):
+def test_a_value_of_another_type_is_refused(read, old):
     assert old in WHOLE
     new, message = TYPES[old]
     with pytest.raises(InputError, match=f"config.yml: {message}, which is not of its type"):
-        read_config(saved(WHOLE.replace(old, new)))
+        read(WHOLE.replace(old, new))
 
 
 def test_a_pipeline_refuses_it_too():
@@ -115,15 +114,15 @@ def test_a_pipeline_refuses_it_too():
         config.setup(device="cpu")
 
 
-def test_an_option_that_is_newer_than_the_file_has_its_default(saved):
+def test_an_option_that_is_newer_than_the_file_has_its_default(read):
     config = replace(method_config.nrfgs.config, average_steps=3)
     text = yaml.dump(config)
     for option in ("average_steps: 3\n", "    view_noise: 0.5\n", r"  sharding: .*\n(?:    .*\n)+"):
         text, count = re.subn(option, "", text)
         assert count == 1
-    read = read_config(saved(text))
-    assert read.average_steps is None and read.pipeline.model.view_noise == 0.0
-    assert read.pipeline.sharding == config.pipeline.sharding
+    found = read(text)
+    assert found.average_steps is None and found.pipeline.model.view_noise == 0.0
+    assert found.pipeline.sharding == config.pipeline.sharding
 
 
 def test_a_file_that_is_not_there_or_no_configuration(tmp_path):

@@ -10,18 +10,19 @@ from pathlib import Path
 
 import pytest
 import torch
+from densification_cases import Table
 from short_trainings import assert_same_training, checkpoint_of, command_line, config_with, models_of, set_up, trained
 
 from nrfgs_lab.training_run import parse
 from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training import checkpoint_files, stopping
-from nrfgs_ns.training.checkpoint_files import DiskFull, find
+from nrfgs_ns.training.checkpoint_files import DiskFull, find, read_latest
 from nrfgs_ns.training.guard import TrainingStopped
 from nrfgs_ns.training.stopping import StopRequest, heard_signals, rows_agree
 from nrfgs_ns.training.trainer import NrfgsTrainer, writer
 
-pytestmark = pytest.mark.usefixtures("no_cuda")
+pytestmark = pytest.mark.usefixtures("no_cuda", "any_share")
 
 STEPS = 12
 BUSY = {
@@ -60,7 +61,7 @@ def failing(error: BaseException):
 
 
 @pytest.fixture(scope="module")
-def finished(tiny_scene, tmp_path_factory) -> Path:
+def finished(tiny_scene, tmp_path_factory, any_share) -> Path:
     """config.yml of the unbroken training."""
     return trained(command_line("nrfgs", tiny_scene, tmp_path_factory.mktemp("whole"), STEPS, BUSY))
 
@@ -81,6 +82,8 @@ def test_a_signal_at_any_step_saves_and_the_training_goes_on_to_the_bit(
         f"Stopped at step {step}, saved. Go on with the same command and --load-dir {folder}"
     )
     assert list(find(folder)) == [step]
+    mean = read_latest(folder)[1]["training"].get("parameter_mean")
+    assert mean["count"] == 2 if step == 9 else mean is None  # of steps 8 and 9
     rest = trained(command_line("nrfgs", tiny_scene, tmp_path / "b", STEPS, BUSY, {"--load-dir": folder}))
     assert_same_training(checkpoint_of(finished), checkpoint_of(rest), rtol=0, atol=0)
 
@@ -301,17 +304,9 @@ def test_only_a_second_ctrl_c_stops_at_once(second, seconds, ends, monkeypatch):
     assert ended == ([130] if ends else [])
 
 
-def table(rows: int):
-    splats = {name: torch.nn.Parameter(torch.zeros(rows, 3)) for name in ("means", "scales")}
-    optimizers = {name: torch.optim.Adam([value]) for name, value in splats.items()}
-    for name, value in splats.items():
-        value.grad = torch.ones_like(value)
-        optimizers[name].step()
-    return splats, optimizers
-
-
 def test_a_table_that_is_half_changed_is_known():
-    splats, optimizers = table(5)
+    table = Table(5)
+    splats, optimizers = dict(table.splats), table.optimizers
     assert rows_agree(splats, optimizers, [torch.zeros(5), None, 0.5, torch.tensor(3)])
     assert not rows_agree(splats, optimizers, [torch.zeros(6)])
     longer = torch.nn.Parameter(torch.zeros(6, 3))

@@ -10,6 +10,7 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from torch.testing import assert_close
 
 from nrfgs_ns.training.optimizers import LeanOptimizers, step_at_once
+from nrfgs_ns.training.pace import Pace
 
 
 @pytest.mark.gpu
@@ -28,7 +29,10 @@ def test_all_tensors_in_one_kernel_step_as_torchs():
         ]
         sides.append((parameters, made))
     for step in range(5):
-        set_gradients(sides, step)
+        for parameters, _ in sides:
+            torch.manual_seed(step)
+            for parameter in parameters:
+                parameter.grad = torch.randn_like(parameter)
         verdict = torch.tensor(float(step == 3), device="cuda")
         for mine, theirs in zip(sides[0][1], sides[1][1], strict=True):
             mine.found_inf = verdict
@@ -44,24 +48,13 @@ def test_all_tensors_in_one_kernel_step_as_torchs():
         assert next(iter(mine.state.values()))["step"] == next(iter(theirs.state.values()))["step"] == 4
 
 
-def set_gradients(sides, seed):
-    for parameters, _ in sides:
-        torch.manual_seed(seed)
-        for parameter in parameters:
-            parameter.grad = torch.randn_like(parameter)
-
-
-def group(fused: bool):
+def group(fused: bool, pace: Pace | None = None):
     """Nerfstudio's optimisers over one parameter; on a CPU fused has to be asked for."""
-    config = {
-        "means": {
-            "optimizer": AdamOptimizerConfig(lr=0.1, eps=1e-15),
-            "scheduler": ExponentialDecaySchedulerConfig(lr_final=0.001, max_steps=10),
-        }
-    }
+    decay = ExponentialDecaySchedulerConfig(lr_final=0.001, max_steps=10)
+    config = {"means": {"optimizer": AdamOptimizerConfig(lr=0.1, eps=1e-15), "scheduler": decay}}
     torch.manual_seed(0)
     parameter = torch.nn.Parameter(torch.randn(5, 3))
-    optimizers = LeanOptimizers(config, {"means": [parameter]})
+    optimizers = LeanOptimizers(config, {"means": [parameter]}, pace=pace)
     for settings in optimizers.optimizers["means"].param_groups:
         settings["fused"] = True if fused else None
     return parameter, optimizers
@@ -85,6 +78,17 @@ def test_training_with_a_schedule_is_nerfstudios():
                 optimizers.scheduler_step_all(step)
         results.append(parameter.detach())
     assert_close(*results)
+
+
+def test_learning_rates_are_those_of_the_position():
+    """Step s of N has the learning rate of step s L / N of the L that the schedule is laid out for."""
+    _, optimizers = group(fused=False, pace=Pace(10, rate=0.25))
+    optimizers.step()  # torch warns if a schedule runs ahead of its optimiser
+    rates = []
+    for step in range(40):
+        rates.append(optimizers.optimizers["means"].param_groups[0]["lr"])
+        optimizers.scheduler_step_all(step)
+    assert rates == pytest.approx([0.1 * 0.01 ** (0.25 * step / 10) for step in range(40)])
 
 
 def test_a_loaded_state_is_moved_to_what_the_optimiser_runs_on():

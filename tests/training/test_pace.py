@@ -9,8 +9,6 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from nerfstudio.engine.optimizers import AdamOptimizerConfig
-from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.utils.eval_utils import eval_setup
 from short_trainings import REFINING, assert_same_training, checkpoint_of, command_line, models_of, trained
 
@@ -19,7 +17,6 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.method_config import nrfgs
 from nrfgs_ns.training import pace, trainer_config
 from nrfgs_ns.training.checkpoint_files import find, read
-from nrfgs_ns.training.optimizers import LeanOptimizers
 from nrfgs_ns.training.pace import Pace, TimedPace, resolution_phases, steps_for
 
 LENGTH = 30_000
@@ -92,19 +89,6 @@ def test_steps_of_positions():
     assert pace.position == LENGTH
 
 
-def test_learning_rates_are_those_of_the_position():
-    """Step s of N has the learning rate of step s L / N of the L that the schedule is laid out for."""
-    decay = ExponentialDecaySchedulerConfig(lr_final=0.001, max_steps=100)
-    config = {"means": {"optimizer": AdamOptimizerConfig(lr=0.1, eps=1e-15), "scheduler": decay}}
-    optimizers = LeanOptimizers(config, {"means": [torch.nn.Parameter(torch.zeros(1))]}, pace=Pace(100, rate=2.5))
-    optimizers.step()  # torch warns if a schedule runs ahead of its optimiser
-    rates = []
-    for step in range(40):
-        rates.append(optimizers.optimizers["means"].param_groups[0]["lr"])
-        optimizers.scheduler_step_all(step)
-    assert rates == pytest.approx([0.1 * 0.01 ** (2.5 * step / 100) for step in range(40)])
-
-
 SCHEDULES = {
     "--pipeline.model.densification": (
         "splatfacto,warmup_length=8,refine_every=2,reset_alpha_every=100,densify_grad_thresh=1e-6,stop_split_at=30"
@@ -113,14 +97,10 @@ SCHEDULES = {
     "--pipeline.model.num-downscales": 1,
 }
 """All that has a schedule, laid out for 40 steps."""
-SH = {"--pipeline.model.appearance.degree-interval": 10}
+SH = {**SCHEDULES, "--pipeline.model.appearance.degree-interval": 10}
 CALM = {"--pipeline.model.densification": "splatfacto,refine_every=1000"}
 """No densification, which every second step would double the splats until a step takes a second."""
 STRETCHED = {"--schedule-steps": 40, "--steps-per-save": 3}
-
-
-def options(scene: Path, out: Path, method: str, steps: int, *more: dict) -> list[str]:
-    return command_line(method, scene, out, steps, SCHEDULES, *more)
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +109,7 @@ def stretched(tiny_scene, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(torch.cuda, "is_available", lambda: False)  # as where it goes on
         every = {"--save-only-latest-checkpoint": False}
-        return trained(options(tiny_scene, tmp_path_factory.mktemp("out"), "nrfgs-sh", 20, SH, STRETCHED, every))
+        return trained(command_line("nrfgs-sh", tiny_scene, tmp_path_factory.mktemp("out"), 20, SH, STRETCHED, every))
 
 
 @pytest.mark.usefixtures("no_cuda")
@@ -150,13 +130,13 @@ def test_a_stretched_training(stretched):
 @pytest.mark.usefixtures("no_cuda")
 def test_a_stretched_training_continues_to_the_bit(stretched, tiny_scene, tmp_path):
     load = {"--load-dir": models_of(stretched), "--load-step": 9}
-    rest = trained(options(tiny_scene, tmp_path / "rest", "nrfgs-sh", 20, SH, STRETCHED, load))
+    rest = trained(command_line("nrfgs-sh", tiny_scene, tmp_path / "rest", 20, SH, STRETCHED, load))
     one, other = checkpoint_of(stretched), checkpoint_of(rest)
     assert one["step"] == 19
     assert_same_training(one, other, rtol=0, atol=0)
     assert one["schedulers"] == other["schedulers"]
     with pytest.raises(InputError, match="schedule-steps"):
-        train(options(tiny_scene, tmp_path / "plain", "nrfgs-sh", 20, SH, load))
+        train(command_line("nrfgs-sh", tiny_scene, tmp_path / "plain", 20, SH, load))
 
 
 class SecondsAStep(TimedPace):
@@ -176,7 +156,8 @@ def test_a_training_ends_when_its_time_is_up(tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(trainer_config, "TimedPace", SecondsAStep)
 
     def run(name, minutes, *more):
-        record = train(options(tiny_scene, tmp_path / name, "nrfgs", 40, CALM, {"--time-budget": minutes}, *more))
+        options = SCHEDULES, CALM, {"--time-budget": minutes}, *more
+        record = train(command_line("nrfgs", tiny_scene, tmp_path / name, 40, *options))
         config = Path(record.config_path)
         state = checkpoint_of(config)
         return record, models_of(config), state["step"], state["training"]["pace"]

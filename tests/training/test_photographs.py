@@ -63,10 +63,6 @@ def test_exposure_in_stops_of_exif_from_the_data_set_or_else_from_the_file(tmp_p
 
 
 # Trainings.
-def linear(values):
-    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
-
-
 @pytest.fixture(scope="module")
 def exposed_scene(tmp_path_factory):
     """A procedural data set of 24 photographs, 128 x 96, with known stops, and those stops by name."""
@@ -80,8 +76,9 @@ def exposed_scene(tmp_path_factory):
         path = scene / frame["file_path"]
         drawn = random.uniform(-1, 1) + 0.1 * random.standard_normal(3)
         with Image.open(path) as image:
-            pixels = np.asarray(image.convert("RGB"))
-        light = np.clip(linear(pixels / 255.0) * 2.0**drawn, 0.0, 1.0)
+            values = np.asarray(image.convert("RGB")) / 255.0
+        light = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+        light = np.clip(light * 2.0**drawn, 0.0, 1.0)
         values = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
         Image.fromarray(np.rint(255.0 * values).astype(np.uint8)).save(path)
         stops[path.name] = drawn
