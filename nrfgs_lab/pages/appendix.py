@@ -117,10 +117,10 @@ def changes(trials: dict[str, str], sitting: str) -> str:
 
 def today_changes() -> str:
     """Mean changes by trials against today's default over splits: dB, with their standard error, and SSIM."""
-    runs, texts = {(one["name"], one["scene"]): one for one in records("trials").values()}, []
+    runs, texts = records("trials"), []
     for trial in TODAY:
-        scenes = [scene for name, scene in runs if name == f"today: {trial}"]
-        pairs = [(runs[f"today: {trial}", scene], runs["today: default", scene]) for scene in scenes]
+        name = f"today: {trial}"
+        pairs = [(one, runs[key.replace(name, "today: default")]) for key, one in runs.items() if one["name"] == name]
         dB, ssim = ([one[metric] - base[metric] for one, base in pairs] for metric in ("psnr", "ssim"))
         error = stdev(dB) / len(dB) ** 0.5
         texts.append(f"{trial} {signed(fmean(dB), 2)} ± {error:.2f} dB, {signed(fmean(ssim), 3)}")

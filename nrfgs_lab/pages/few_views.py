@@ -31,19 +31,19 @@ def today(scene: str, name: str, strategy: str = OWN) -> Trainings:
     return trainings("default", scene, name.replace(",", "_").replace(" ", "_"), strategy)
 
 
-def _ahead(gains: list[float], digits: int = 1) -> str:
+def ahead(gains: list[float], digits: int = 1) -> str:
     """Gain in the median view in dB, and the number of views with a gain."""
     return f"{signed(median(gains), digits)} ({sum(one > 0 for one in gains)}/{len(gains)})" if gains else "-"
 
 
 def verdict(gains: list[float]) -> str:
     """Whether the first of two is better by a two-sided sign test over views at 5 %."""
-    ahead = sum(one > 0 for one in gains)
+    better = sum(one > 0 for one in gains)
     if 0.5 ** (len(gains) - 1) >= 0.05:  # even if all agree
         return "too few test views"
-    if binomtest(ahead, len(gains)).pvalue >= 0.05:
+    if binomtest(better, len(gains)).pvalue >= 0.05:
         return "no difference seen"
-    return "better" if 2 * ahead > len(gains) else "worse"
+    return "better" if 2 * better > len(gains) else "worse"
 
 
 def captures() -> str:
@@ -53,7 +53,7 @@ def captures() -> str:
     for scene, views in VIEWS.items():
         field, host = today(scene, FIELD), runs_of(scene, HOST)
         gains = view_gains(field, today(scene, SAME))
-        body.append([f"{scene}, {views}", cell(field), cell(host), f"{verdict(gains)}: {_ahead(gains)}"])
+        body.append([f"{scene}, {views}", cell(field), cell(host), f"{verdict(gains)}: {ahead(gains)}"])
     return grid(["capture, training views", "`nrfgs`", "splatfacto", "`nrfgs` against harmonics"], body)
 
 
@@ -145,7 +145,7 @@ def sparse() -> str:
         runs = sparse_runs(scene)
         gains = view_gains(*runs)
         label = f"{scene.rpartition('_')[2]}, {views}"
-        body.append([label, *map(cell, runs), f"{verdict(gains)}: {_ahead(gains)}", published])
+        body.append([label, *map(cell, runs), f"{verdict(gains)}: {ahead(gains)}", published])
     return grid(["training views", "`nrfgs`", "harmonics", "`nrfgs` against harmonics", "3DGS, published"], body)
 
 

@@ -9,8 +9,8 @@ from functools import partial
 from statistics import median
 
 from nrfgs_lab.pages.few_views import FIELD, SAME, sparse_runs, today
-from nrfgs_lab.pages.methods import COUNTS, CURVES, HEADS_OF, RULES_OF, SEATS_OF, equal
-from nrfgs_lab.pages.runs import ROOT, VIEWS, mean, view_gains
+from nrfgs_lab.pages.methods import COUNTS, CURVES, HEADS_OF, RULES_OF, SEATS_OF, Labels, equal
+from nrfgs_lab.pages.runs import ROOT, VIEWS, view_gains
 from nrfgs_ns.files import write_whole
 
 WIDTH, LEFT, ROW = 640, 130, 34
@@ -50,48 +50,60 @@ def views() -> str:
 
 LINES = "#0969da", "#bc4c00", "#1a7f37", "#8250df", "#bf3989", "#808890"
 """Colours that are seen on white and on black."""
+PANEL, HIGH, SIDE = 210, 190, 40
+"""Width of a panel with its numbers, height of its lines, and room beside them."""
 
 
-def curves(labels: dict[str, tuple[str, str]], metric: str = "psnr") -> str:
-    """A metric over numbers of splats on three captures: a line for each label's run and rule."""
-    panel, top, bottom, side = (WIDTH - 10) / len(CURVES), 28, 218, 40
-    parts = []
-    for column, scene in enumerate(CURVES):
-        runs = {label: [equal(scene, run, n, rule) for n in COUNTS] for label, (run, rule) in labels.items()}
-        lines = {
-            label: [(one["splats"], mean([one], metric)) for one in sum(found, [])] for label, found in runs.items()
-        }
-        values = [value for points in lines.values() for _, value in points]
-        step = 1 if max(values) - min(values) > 2.5 else 0.5
-        low, high = math.floor(min(values) / step) * step, math.ceil(max(values) / step) * step
-        left = panel * column + side
-        x = lambda n, left=left: round(left + math.log(n / 65_000) / math.log(330_000 / 65_000) * (panel - side), 1)  # noqa: E731
-        y = lambda v, low=low, high=high: round(bottom - (v - low) / (high - low) * (bottom - top), 1)  # noqa: E731
-        for tick in range(round((high - low) / step) + 1):
-            at = y(low + tick * step)
-            parts.append(f'<line class="faint" x1="{left}" x2="{left + panel - side}" y1="{at}" y2="{at}"/>')
-            parts.append(f'<text x="{left - 5}" y="{at + 5}" text-anchor="end">{low + tick * step:g}</text>')
-        parts.append(f'<text x="{left}" y="16">{scene}, dB</text>')
-        parts += [f'<text x="{x(n)}" y="{bottom + 20}" text-anchor="middle">{n // 1000}k</text>' for n in COUNTS]
-        for colour, points in zip(LINES, lines.values(), strict=False):
-            places = " ".join(f"{x(n)},{y(v)}" for n, v in points)
-            parts.append(f'<polyline fill="none" stroke="{colour}" stroke-width="2.5" points="{places}"/>')
-            parts += [f'<circle fill="{colour}" cx="{x(n)}" cy="{y(v)}" r="4"/>' for n, v in points]
-    for row, (colour, label) in enumerate(zip(LINES, labels, strict=False)):
-        at, line = 12 + 315 * (row % 2), bottom + 46 + 22 * (row // 2)
-        parts.append(
-            f'<line stroke="{colour}" stroke-width="4" x1="{at}" x2="{at + 26}" y1="{line - 5}" y2="{line - 5}"/>'
-        )
-        parts.append(f'<text x="{at + 34}" y="{line}">{label}</text>')
-    height = bottom + 34 + 22 * -(-len(labels) // 2)
+def curves(labels: Labels, metrics: tuple[str, ...] = ("psnr",)) -> str:
+    """Metrics over numbers of splats on three captures: a panel each, a line for each label's run and rule."""
+    places = [
+        (scene, metric, PANEL * x, (HIGH + 62) * y)
+        for y, metric in enumerate(metrics)
+        for x, scene in enumerate(CURVES)
+    ]
+    parts = [part for place in places for part in panel(labels, *place)]
+    top = (HIGH + 62) * len(metrics) + 12
+    for index, (colour, label) in enumerate(zip(LINES, labels, strict=False)):
+        x, y = 12 + 315 * (index % 2), top + 22 * (index // 2)
+        parts.append(f'<line stroke="{colour}" stroke-width="4" x1="{x}" x2="{x + 26}" y1="{y - 5}" y2="{y - 5}"/>')
+        parts.append(f'<text x="{x + 34}" y="{y}">{label}</text>')
+    height = top + 22 * -(-len(labels) // 2)
     head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}">\n<style>{STYLE}</style>'
     return "\n".join([head, *parts, "</svg>", ""])
+
+
+def panel(labels: Labels, scene: str, metric: str, left: float, top: float) -> list[str]:
+    """One capture's lines, with a logarithmic axis of splats."""
+    found = [sum((equal(scene, run, count, rule) for count in COUNTS), []) for run, rule in labels.values()]
+    lines = [[(one["splats"], one[metric]) for one in runs] for runs in found]
+    values = [value for line in lines for _, value in line]
+    step = next(step for step in (0.01, 0.02, 0.5, 1.0) if max(values) - min(values) < 6 * step)
+    low, high = math.floor(min(values) / step) * step, math.ceil(max(values) / step) * step
+    left, top, right = left + SIDE, top + 28, left + PANEL
+
+    def at(count: int, value: float) -> tuple[float, float]:
+        x = left + math.log(count / 65_000) / math.log(330_000 / 65_000) * (right - left)
+        return round(x, 1), round(top + (high - value) / (high - low) * HIGH, 1)
+
+    parts = [f'<text x="{left}" y="{top - 12}">{scene}, {"dB" if metric == "psnr" else "SSIM"}</text>']
+    for tick in (low + step * index for index in range(round((high - low) / step) + 1)):
+        y = at(65_000, tick)[1]
+        parts.append(f'<line class="faint" x1="{left}" x2="{right}" y1="{y}" y2="{y}"/>')
+        parts.append(f'<text x="{left - 5}" y="{y + 5}" text-anchor="end">{tick:.4g}</text>')
+    for count in COUNTS:
+        x = at(count, low)[0]
+        parts.append(f'<text x="{x}" y="{top + HIGH + 20}" text-anchor="middle">{count // 1000}k</text>')
+    for colour, points in zip(LINES, ([at(*one) for one in line] for line in lines), strict=False):
+        joined = " ".join(f"{x},{y}" for x, y in points)
+        parts.append(f'<polyline fill="none" stroke="{colour}" stroke-width="2.5" points="{joined}"/>')
+        parts += [f'<circle fill="{colour}" cx="{x}" cy="{y}" r="4"/>' for x, y in points]
+    return parts
 
 
 FIGURES = {
     "views.svg": views,
     "heads.svg": partial(curves, HEADS_OF),
-    "rules.svg": partial(curves, RULES_OF),
+    "rules.svg": partial(curves, RULES_OF, ("psnr", "ssim")),
     "seats.svg": partial(curves, SEATS_OF),
 }
 

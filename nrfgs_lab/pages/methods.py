@@ -3,7 +3,7 @@
 
 from statistics import fmean, median
 
-from nrfgs_lab.pages.few_views import cell
+from nrfgs_lab.pages.few_views import ahead, cell, verdict
 from nrfgs_lab.pages.runs import (
     ORIGINAL,
     VIEWS,
@@ -117,6 +117,8 @@ def over_gsnb() -> str:
 # Equal numbers of splats, at half size, in 10,000 steps, one seed.
 
 COUNTS, CURVES = (75_000, 150_000, 300_000), ("bonsai", "goldcape", "caliterra")
+Labels = dict[str, tuple[str, str]]
+"""Label of a line in a figure -> its run and rule."""
 BY_ERROR, FROZEN = "error-guided", "field, its network frozen at random"
 HEADS_OF = {
     run: (run, BY_ERROR) for run in ("field", "field without opacity residual", "GSNB", "VDGS", "harmonics", FROZEN)
@@ -128,7 +130,6 @@ RULES_OF = {
     "3DGS-MCMC": ("field", "mcmc"),
 }
 SEATS_OF = {run: (run, BY_ERROR) for run in ("field", "harmonics", "network at the pixel", "convolutions at the pixel")}
-"""Label of a line in a figure -> its run and rule."""
 
 
 def equal(scene: str, run: str, count: int = COUNTS[1], rule: str = BY_ERROR) -> Trainings:
@@ -149,31 +150,44 @@ def at_equal_numbers() -> str:
     return grid(["", *scenes], body)
 
 
-def seats() -> str:
-    """Quality, cost and flicker of networks at the splat and at the pixel."""
-    names = {"field": "nrfgs", "harmonics": "nrfgs-sh"}
-    names |= {"network at the pixel": "nrfgs-deferred", "convolutions at the pixel": "nrfgs-latent-spec"}
-    costs, body = records("pixel"), []
-    for run, method in names.items():
-        quality = [cell(equal(scene, run)) for scene in (*CURVES, "castle")]
-        small, large = ([costs[f"300000/{size}/{method}/{turn}"] for turn in turns] for size, turns in SIZES.items())
-        frames = "/".join(f"{max(one[size] for one in small):.0f}" for size in ("1080p", "4K"))
-        steps = [f"{median(one['step_ms'] for one in ones):.1f}" for ones in (small, large)]
-        still = costs[f"flicker/{run}/bonsai"]
-        more = [
-            *steps,
-            frames,
-            f"{large[0]['peak_mb'] / 1000:.1f}",
-            f"{still['flicker']:.2f}",
-            f"{still['psnr']['2']:.1f}",
+def over(other: str) -> str:
+    """Verdicts on the field and another head with 150,000 splats."""
+    gains = {scene: view_gains(equal(scene, "field"), equal(scene, other)) for scene in CURVES}
+    return "; ".join(f"`{scene}` {verdict(views)}: {ahead(views)}" for scene, views in gains.items())
+
+
+def first_rule() -> str:
+    """On how many captures and numbers growth by error is ahead of the field's other rules."""
+    firsts = []
+    for metric in "psnr", "ssim":
+        best = [
+            max(RULES_OF, key=lambda n: mean(equal(s, RULES_OF[n][0], c, RULES_OF[n][1]), metric))
+            for s in CURVES
+            for c in COUNTS
         ]
-        body.append([f"**{run}**" if run == "field" else run, *quality, *more])
-    columns = "step at 0.4 MP, ms", "at 2 MP", "frames a second, 1080p/4K", "GB at 2 MP", "flicker", "twice the size"
-    return grid(["", *CURVES, "castle", *columns], body)
+        firsts.append(f"{sum(RULES_OF[name][1] == BY_ERROR for name in best)} of {len(best)}")
+    return "PSNR in {} cases, SSIM in {}".format(*firsts)
 
 
-SIZES = {0.4: (0, 1), 2.0: (0,)}
-"""Megapixels of a timed step -> its repeats."""
+SEATS = {"field": "nrfgs", "harmonics": "nrfgs-sh", "network at the pixel": "nrfgs-deferred"}
+SEATS["convolutions at the pixel"] = "nrfgs-latent-spec"
+"""Run -> its method in a record of costs."""
+
+
+def seats() -> str:
+    """Quality, cost and stillness of networks at the splat and at the pixel."""
+    costs, body = records("pixel"), []
+    for run, method in SEATS.items():
+        turns, large = [costs[f"300000/0.4/{method}/{turn}"] for turn in (0, 1)], costs[f"300000/2.0/{method}/0"]
+        small = {name: fmean(one[name] for one in turns) for name in ("step_ms", "1080p", "4K")}
+        still = costs[f"flicker/{run}/bonsai"]
+        quality = [cell(equal(scene, run)) for scene in (*CURVES, "castle")]
+        cost = f"{small['step_ms']:.1f}/{large['step_ms']:.1f}", f"{large['peak_mb'] / 1000:.1f}"
+        frames, calm = f"{small['1080p']:.0f}/{small['4K']:.0f}", f"{still['flicker']:.2f}"
+        body.append([run, *quality, *cost, frames, calm, f"{still['psnr']['2']:.1f}"])
+    cost = "ms of a step, 0.4/2 MP", "GB at 2 MP", "frames a second, 1080p/4K"
+    return grid(["", *CURVES, "castle", *cost, "flicker", "twice the size, dB"], body)
+
 
 # The choice of the heads' settings.
 
@@ -232,7 +246,7 @@ def noise() -> str:
 
 
 BLOCKS = {
-    **{f"comparison.{block.__name__}": block for block in (every, gains, parts, over_gsnb, chosen, at_equal_numbers)},
-    "pixel.seats": seats,
+    **{f"comparison.{block.__name__}": block for block in (every, gains, parts, over_gsnb, chosen)},
+    **{f"equal.{block.__name__}": block for block in (at_equal_numbers, over, first_rule, seats)},
     **{f"deviations.{block.__name__}": block for block in (worth, noise)},
 }
