@@ -144,9 +144,7 @@ def statistics(model, info) -> dict:
     rules = model.densification
     rules.take_changes(info, model.num_points)
     if isinstance(rules, GradientDensification):
-        if rules.state["count"] is None:  # gsplat adds ones of float32, whatever the default
-            rules.state["count"] = torch.zeros(model.num_points, dtype=torch.float32, device=model.device)
-        rules.strategy._update_state(model.gauss_params, rules.state, info, packed=True)
+        rules._take_statistics(info, model.num_points)
     return {key: value.clone() for key, value in rules.state.items() if isinstance(value, torch.Tensor)}
 
 
