@@ -5,20 +5,18 @@ from collections import defaultdict
 from collections.abc import Iterator
 from statistics import fmean, median, stdev
 
-from nrfgs_lab.pages.few_views import FEW, FIELD, SAME, SHRUNK, cell, runs_of, today, views_of
+from nrfgs_lab.pages.few_views import FIELD, SAME, cell, runs_of, today
 from nrfgs_lab.pages.runs import VIEWS, Trainings, grid, mean, records, signed
 from nrfgs_lab.pages.speed import RENDERERS, scale_cells
 
 RIVALS = {
     "field, splatfacto's": "nrfgs",
-    "harmonics, splatfacto's": SHRUNK,
     "field, MCMC": "nrfgs, 150,000 splats",
     "harmonics, MCMC": "harmonics, 150,000 splats",
 }
 """Label -> trainings in results/captures.json."""
 GAPS = {
     "**twice the residual, on the logit**: `nrfgs`": "twice on the logit",
-    "residual on the logit": "on the logit",
     "harmonics, same rules": "harmonics",
 }
 """Label -> trial with gaps in results/trials.json; its default added the residual to the opacity."""
@@ -27,17 +25,8 @@ TODAY = (
     "twice the colour residual",
     "antialiased",
     "a term against needles",
-    "opacities at 0.4 of their rate",
 )
 """Trials in results/trials.json against today's default."""
-RULES = {
-    "**by error, points from photographs, near plane**": "by error, dense start, near plane",
-    "without the near plane": "by error, dense start",
-    "without points from photographs": "by error, near plane",
-}
-"""Label -> trial in results/trials.json."""
-BASE = "splatfacto's rules"
-"""The trial that `RULES` are compared with."""
 
 
 def default() -> str:
@@ -47,13 +36,13 @@ def default() -> str:
         both = today(scene, FIELD), today(scene, SAME)
         seeds = [", ".join(f"{one['psnr']:.2f}" for one in runs) for runs in both]
         body.append([scene, *seeds, *map("/".join, zip(*map(_metrics, both), strict=True))])
-    head = "SSIM", "MS-SSIM", "FLIP", "median view", "worst view", "gap", "splats"
+    head = "SSIM", "FLIP", "median view", "worst view", "gap", "splats"
     return grid(["", "PSNR of the field", "of harmonics", *head], body)
 
 
 def _metrics(runs: Trainings) -> list[str]:
     """Means over trainings, and the worst view of all."""
-    cells = [f"{mean(runs, metric):.3f}" for metric in ("ssim", "ms_ssim", "flip")]
+    cells = [f"{mean(runs, metric):.3f}" for metric in ("ssim", "flip")]
     middle = fmean(median(view[1] for view in one["per_image"]) for one in runs)
     worst = min(view[1] for one in runs for view in one["per_image"])
     gap = mean(runs, "train_psnr") - mean(runs, "psnr")
@@ -66,29 +55,6 @@ def rivals() -> str:
         [scene, cell(today(scene, FIELD)), *(cell(runs_of(scene, name)) for name in RIVALS.values())] for scene in VIEWS
     ]
     return grid(["", "`nrfgs`", *RIVALS], body)
-
-
-def rules() -> str:
-    """Gains of trials over splatfacto's rules on the held-out views that both have, and their share of its splats."""
-    body, theirs, base = [], views_of("trials", BASE), _splats(BASE)
-    for label, trial in RULES.items():
-        ours, cells, splats = views_of("trials", trial), [], _splats(trial)
-        for scene in FEW:
-            pairs = [(ours[view], theirs[view]) for view in theirs if view in ours and view[0] == scene]
-            psnr, ssim = ([one[number] - other[number] for one, other in pairs] for number in (0, 1))
-            cells.append(f"{signed(median(psnr), 2)}/{signed(1000 * fmean(ssim), 0)}" if pairs else "")
-        share = median(splats[scene] / base[scene] for scene in splats.keys() & base.keys())
-        body.append([label, *cells, f"{share:.1f}"])
-    return grid(["", *FEW, "splats"], body)
-
-
-def _splats(trial: str) -> dict[str, float]:
-    """Mean number of splats of a trial's trainings, by scene."""
-    splats = defaultdict(list)
-    for one in records("trials").values():
-        if one["name"] == trial:
-            splats[one["scene"]].append(one["splats"])
-    return {scene: fmean(counts) for scene, counts in splats.items()}
 
 
 def _changes(sitting: str, trial: str) -> dict[str, tuple[float, float, float]]:
@@ -133,9 +99,10 @@ def logit() -> str:
     for sitting, where in (("gaps", "with 13 to 24 training views"), ("half size", "with 37 to 223")):
         changed = _changes(sitting, "twice on the logit").values()
         dB, ssim, share = (fmean(one[number] for one in changed) for number in range(3))
-        numbers = f"{signed(dB, 2)} dB and {signed(ssim, 3)} SSIM with {share:.1f} of the splats"
-        texts.append(f"{numbers} in the mean of {len(changed)} captures {where}")
-    return ", and ".join(texts)
+        texts.append(
+            f"{signed(dB, 2)} dB, {signed(ssim, 3)} SSIM and x{share:.1f} splats on {len(changed)} captures {where}"
+        )
+    return "; ".join(texts)
 
 
 def scale() -> str:
@@ -160,7 +127,6 @@ def scale() -> str:
 BLOCKS = {
     "tables.default": default,
     "tables.rivals": rivals,
-    "tables.rules": rules,
     "captures.logit": logit,
     "tables.gaps": lambda: changes(GAPS, "gaps"),
     "tables.today": today_changes,

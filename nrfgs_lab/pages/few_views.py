@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blocks of README.md, docs/captures.md and docs/deviations.md: captures' test views, and trials on held-out views."""
+"""Blocks of README.md, docs/captures.md and docs/tables.md: captures' test views, and trials on held-out views."""
 
 from collections import defaultdict
 from collections.abc import Mapping
@@ -55,13 +55,6 @@ def captures() -> str:
         gains = view_gains(field, today(scene, SAME))
         body.append([f"{scene}, {views}", cell(field), cell(host), f"{verdict(gains)}: {ahead(gains)}"])
     return grid(["capture, training views", "`nrfgs`", "splatfacto", "`nrfgs` against harmonics"], body)
-
-
-def over_former(metric: str, digits: str) -> str:
-    """Mean gain of today's default over the one with splatfacto's densification, and least and most."""
-    gains = [mean(today(scene, FIELD), metric) - mean(runs_of(scene, FIELD), metric) for scene in VIEWS]
-    middle, least, most = (signed(bound(gains), int(digits)) for bound in (fmean, min, max))
-    return f"{middle} ({least} to {most})"
 
 
 def over_host_where_seen() -> str:
@@ -149,37 +142,14 @@ def sparse() -> str:
     return grid(["training views", "`nrfgs`", "harmonics", "`nrfgs` against harmonics", "3DGS, published"], body)
 
 
-def moved() -> str:
-    """On how many captures MCMC is better on test views with the residual on the logit, and where not."""
-    names = "nrfgs, 150,000 splats, opacity added", "nrfgs, 150,000 splats"
-    added, logit = (
-        {one["scene"]: one for one in records("captures").values() if one["name"] == name} for name in names
-    )
-    worse = [scene for scene in added if logit[scene]["psnr"] < added[scene]["psnr"]]
-    cells = [f"`{scene}`, {added[scene]['psnr']:.2f} to {logit[scene]['psnr']:.2f} dB" for scene in worse]
-    return f"better on {len(added) - len(worse)} captures of {len(added)} (not on {', '.join(cells)})"
-
-
-def twice() -> str:
-    """PSNR by MCMC with a residual of 0.2 on the logit, and of 0.4."""
-    name, found = "MCMC, 150,000 splats: {} on the logit", records("trials").values()
-    once, doubled = (
-        {one["scene"]: one["psnr"] for one in found if one["name"] == name.format(kind)} for kind in ("once", "twice")
-    )
-    return ", ".join(f"`{scene}` {once[scene]:.2f} to {doubled[scene]:.2f} dB" for scene in VIEWS if scene in once)
-
-
 BLOCKS = {
     "readme.captures": captures,
     "readme.over_host_where_seen": over_host_where_seen,
     "readme.over_same": over_same,
     "readme.demo": demo,
-    "captures.over_former": over_former,
     "captures.rules_gain": rules_gain,
     "captures.floaters": floaters,
     "captures.today": summary,
     "captures.sparse": sparse,
     "captures.run": lambda name: _run(records("trials")[name]),
-    "deviations.moved": moved,
-    "deviations.twice": twice,
 }

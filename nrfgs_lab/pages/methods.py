@@ -21,7 +21,7 @@ from nrfgs_lab.pages.runs import (
 # Every capture at half its size, in 10,000 steps.
 
 BASE = "3DGS"
-METHODS = "VDGS", "GSNB", "SG", "NRF-GS", "ours"
+METHODS = "VDGS", "GSNB", "SG", "NRF-GS"
 OF_THE_PAPER = {"VDGS": (0.49, 1.286), "GSNB": (0.96, 1.175), "NRF-GS": (1.01, 0.456)}
 """The paper's gains on bonsai, in dB, and splats in multiples of 3DGS's."""
 
@@ -39,12 +39,12 @@ def gain(ours: Trainings, theirs: Trainings, metric: str) -> float:
 def every() -> str:
     """3DGS's PSNR and SSIM, and the others' gains, dB and SSIM x 1000; the median share of its splats."""
     psnr = f"{mean_of(bench_rows('paper')['bonsai', ORIGINAL, BASE], 'PSNR'):.2f}"
-    body = [[BASE, "", psnr, *(cell(half(scene, BASE)) for scene in VIEWS), "", ""]]
+    body = [[BASE, "", psnr, *(cell(half(scene, BASE)) for scene in VIEWS), ""]]
     for run in METHODS:
         paper = "{:+.2f} ({:.2f})".format(*OF_THE_PAPER[run]) if run in OF_THE_PAPER else ""
         share = median(mean(half(one, run), "splats") / mean(half(one, BASE), "splats") for one in VIEWS)
-        body.append([run, paper, _protocol(run), *_gains(run), f"{share:.2f}", _ahead(run)])
-    return grid(["", "paper", "protocol", *VIEWS, "splats", "ahead"], body)
+        body.append([run, paper, _protocol(run), *_gains(run), f"{share:.2f}"])
+    return grid(["", "paper", "protocol", *VIEWS, "splats"], body)
 
 
 def _gains(run: str) -> list[str]:
@@ -69,26 +69,7 @@ def _protocol(run: str) -> str:
     return f"{signed(mean_of(ours, 'PSNR') - mean_of(base, 'PSNR'), 2)} ({share:.2f})"
 
 
-def _ahead(run: str) -> str:
-    """On how many captures a run is above 3DGS: in PSNR, in SSIM, in PSNR in the median test view."""
-    pairs = [(half(scene, run), half(scene, BASE)) for scene in VIEWS]
-    measured = [(gain(*pair, "psnr"), gain(*pair, "ssim"), median(view_gains(*pair))) for pair in pairs]
-    counts = [sum(round(gain, 3) > 0 for gain in gains) for gains in zip(*measured, strict=True)]
-    return "/".join(map(str, counts))
-
-
 # Full size, 30,000 steps, two seeds.
-
-
-def gains(rule: str) -> str:
-    """Gains of the methods over 3DGS on each capture."""
-    rows, parts = bench_rows("comparison"), []
-    for scene in "bonsai", "goldcape":
-        base = mean_of(rows[scene, rule, BASE], "PSNR")
-        cells = [f"{run} {signed(mean_of(rows[scene, rule, run], 'PSNR') - base, 2)}" for run in METHODS[:-1]]
-        parts.append(f"`{scene}` {', '.join(cells)}")
-    return "; ".join(parts)
-
 
 PARTS = {
     "opacity residual": ("no_opacity", 0.35),
@@ -246,7 +227,7 @@ def noise() -> str:
 
 
 BLOCKS = {
-    **{f"comparison.{block.__name__}": block for block in (every, gains, parts, over_gsnb, chosen)},
+    **{f"comparison.{block.__name__}": block for block in (every, parts, over_gsnb, chosen)},
     **{f"equal.{block.__name__}": block for block in (at_equal_numbers, over, first_rule, seats)},
     **{f"deviations.{block.__name__}": block for block in (worth, noise)},
 }

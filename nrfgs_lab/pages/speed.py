@@ -2,43 +2,19 @@
 """Blocks of docs/speed.md and README.md: what trainings cost."""
 
 from collections import defaultdict
-from datetime import datetime, timedelta
-from pathlib import Path
 from statistics import median
-from typing import Any
 
 import numpy as np
 
 from nrfgs_lab.pages.runs import VIEWS, bench_rows, grid, mean_of, records, span
-
-SITTING = timedelta(minutes=10)
-"""Trainings that began within it were made on one machine, one after the other."""
-
-
-def ratio(column: str, run: str, base: str) -> str:
-    """A quantity of trainings of bonsai over another's, of those made in one sitting."""
-
-    def began(record: dict[str, Any]) -> datetime:
-        return datetime.strptime(Path(record["train"]["config_path"]).parent.name, "%Y-%m-%d_%H%M%S")
-
-    ours, theirs = (bench_rows("speed")["bonsai", "own", name] for name in (run, base))
-    ratios = [
-        ours.values[column][seed] / theirs.values[column][other]
-        for seed, one in ours.records.items()
-        for other, two in theirs.records.items()
-        if abs(began(one) - began(two)) < SITTING
-    ]
-    return f"{median(ratios):.2f}"
-
 
 # The choice between methods and presets.
 
 CAPTURES = "bonsai", "fox"
 PRESETS = {
     "splatfacto": "splatfacto",
-    "splatfacto-10k": "the same, 10,000 steps",
     "splatfacto-big": "splatfacto-big",
-    **{run: f"`{run}`" for run in ("nrfgs-sh", "nrfgs-fast", "nrfgs", "nrfgs-best")},
+    **{run: f"`{run}`" for run in ("nrfgs-fast", "nrfgs", "nrfgs-best")},
 }
 
 
@@ -65,8 +41,7 @@ def presets() -> str:
 
 # Steps and frames against splats and pixels (`timing/scale.py`).
 
-RENDERERS = {"nrfgs": "`nrfgs`", "nrfgs-sh": "`nrfgs-sh`", "splatfacto": "splatfacto"}
-RENDERERS |= {"gsplat": "gsplat, bare", "faster-gs": "Faster-GS, bare"}
+RENDERERS = {"nrfgs": "`nrfgs`", "nrfgs-sh": "`nrfgs-sh`", "splatfacto": "splatfacto", "faster-gs": "Faster-GS, bare"}
 
 
 def scale_cells(column: str) -> dict[tuple[int, float], dict[str, list[float]]]:
@@ -96,6 +71,6 @@ def scale_fit(column: str, factor: str, unit: str, renderer: str) -> str:
 
 
 BLOCKS = {
-    **{f"speed.{block.__name__}": block for block in (ratio, scale_fit, scale_ratios)},
+    **{f"speed.{block.__name__}": block for block in (scale_fit, scale_ratios)},
     "trade_off.presets": presets,
 }
