@@ -36,13 +36,13 @@ def default() -> str:
         both = today(scene, FIELD), today(scene, SAME)
         seeds = [", ".join(f"{one['psnr']:.2f}" for one in runs) for runs in both]
         body.append([scene, *seeds, *map("/".join, zip(*map(_metrics, both), strict=True))])
-    head = "SSIM", "FLIP", "median view", "worst view", "gap", "splats"
+    head = "SSIM", "MS-SSIM", "FLIP", "median view", "worst view", "gap", "splats"
     return grid(["", "PSNR of the field", "of harmonics", *head], body)
 
 
 def _metrics(runs: Trainings) -> list[str]:
     """Means over trainings, and the worst view of all."""
-    cells = [f"{mean(runs, metric):.3f}" for metric in ("ssim", "flip")]
+    cells = [f"{mean(runs, metric):.3f}" for metric in ("ssim", "ms_ssim", "flip")]
     middle = fmean(median(view[1] for view in one["per_image"]) for one in runs)
     worst = min(view[1] for one in runs for view in one["per_image"])
     gap = mean(runs, "train_psnr") - mean(runs, "psnr")

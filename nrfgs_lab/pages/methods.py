@@ -162,12 +162,12 @@ def seats() -> str:
         turns, large = [costs[f"300000/0.4/{method}/{turn}"] for turn in (0, 1)], costs[f"300000/2.0/{method}/0"]
         small = {name: fmean(one[name] for one in turns) for name in ("step_ms", "1080p", "4K")}
         still = costs[f"flicker/{run}/bonsai"]
-        quality = [cell(equal(scene, run)) for scene in (*CURVES, "castle")]
+        quality = [cell(equal(scene, run)) for scene in CURVES]
         cost = f"{small['step_ms']:.1f}/{large['step_ms']:.1f}", f"{large['peak_mb'] / 1000:.1f}"
         frames, calm = f"{small['1080p']:.0f}/{small['4K']:.0f}", f"{still['flicker']:.2f}"
         body.append([run, *quality, *cost, frames, calm, f"{still['psnr']['2']:.1f}"])
     cost = "ms of a step, 0.4/2 MP", "GB at 2 MP", "frames a second, 1080p/4K"
-    return grid(["", *CURVES, "castle", *cost, "flicker", "twice the size, dB"], body)
+    return grid(["", *CURVES, *cost, "flicker", "twice the size, dB"], body)
 
 
 # The choice of the heads' settings.

@@ -14,7 +14,7 @@ CAPTURES = "bonsai", "fox"
 PRESETS = {
     "splatfacto": "splatfacto",
     "splatfacto-big": "splatfacto-big",
-    **{run: f"`{run}`" for run in ("nrfgs-fast", "nrfgs", "nrfgs-best")},
+    **{run: f"`{run}`" for run in ("nrfgs-sh", "nrfgs-fast", "nrfgs", "nrfgs-best")},
 }
 
 
@@ -41,7 +41,8 @@ def presets() -> str:
 
 # Steps and frames against splats and pixels (`timing/scale.py`).
 
-RENDERERS = {"nrfgs": "`nrfgs`", "nrfgs-sh": "`nrfgs-sh`", "splatfacto": "splatfacto", "faster-gs": "Faster-GS, bare"}
+RENDERERS = {"nrfgs": "`nrfgs`", "nrfgs-sh": "`nrfgs-sh`", "splatfacto": "splatfacto"}
+RENDERERS |= {"gsplat": "gsplat, bare", "faster-gs": "Faster-GS, bare"}
 
 
 def scale_cells(column: str) -> dict[tuple[int, float], dict[str, list[float]]]:
