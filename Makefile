@@ -6,7 +6,7 @@ DEMO_ARGS ?=
 # uv, not pip: it can leave out the dependencies that need a compiler (requirements.override).
 INSTALL := $(BIN)/uv pip install --quiet --system-certs --python $(BIN)/python --constraint requirements.lock --override requirements.override
 
-.PHONY: demo test test-slow test-browser lint site clean
+.PHONY: demo test test-slow test-gpu test-browser lint site clean
 
 demo: $(VENV)/.installed  ## make a scene, train the field on it, show what it adds
 	$(BIN)/nrfgs demo $(DEMO_ARGS)
@@ -16,6 +16,9 @@ test: $(VENV)/.installed  ## the default test suite, a process for each core
 
 test-slow: $(VENV)/.installed  ## real training runs
 	$(BIN)/python -m pytest -m slow
+
+test-gpu: $(VENV)/.installed  ## kernels and trainings on a CUDA GPU
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m gpu -n 8 --dist worksteal
 
 test-browser: $(VENV)/.installed  ## exported pages in Chromium and in Firefox (firefox-esr, xvfb), if they are on the path
 	$(INSTALL) --editable '.[browser]'
