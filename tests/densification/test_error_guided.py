@@ -184,12 +184,3 @@ def test_growth_ends_at_the_cap_and_in_time():
         table, strategy = Table(40), rules(**options)
         table.step(strategy, step, gradient=1.0)
         assert len(table) == count
-
-
-def test_a_budget_below_the_start_is_told(capsys):
-    strategy = rules(budget=5)
-    strategy.verbose = True
-    strategy.begin(torch.zeros(3, 3), 5, 1)
-    assert capsys.readouterr().out == ""
-    strategy.begin(torch.zeros(3, 3), 6, 1)
-    assert "budget of error-guided is 5, but the training begins with 6" in " ".join(capsys.readouterr().out.split())

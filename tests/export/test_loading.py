@@ -68,10 +68,6 @@ def test_views_of_which_nothing_counts_are_told():
         measure_loss(SimpleNamespace(model=None, datamanager=data), lambda camera: {})
 
 
-def random_rotation(seed: int) -> torch.Tensor:
-    return torch.from_numpy(Rotation.random(random_state=seed + 1).as_matrix())
-
-
 def camera(similarity: Similarity) -> Cameras:
     """Five units before the middle, in a world that was moved."""
     position = 5.0 * similarity.scale * similarity.rotation[:, 2] + similarity.translation
@@ -81,7 +77,10 @@ def camera(similarity: Similarity) -> Cameras:
 
 @pytest.mark.parametrize("similarity", [
     Y_DOWN,
-    *(Similarity(random_rotation(seed), 3.0**seed, torch.randn(3, dtype=torch.float64)) for seed in (-1, 0, 1)),
+    *(
+        Similarity(torch.from_numpy(turn), 3.0**power, torch.randn(3, dtype=torch.float64))
+        for power, turn in zip((-1, 0, 1), Rotation.random(3, random_state=0).as_matrix(), strict=True)
+    ),
     # Half turns, where quaternions have no scalar part.
     Similarity(torch.diag(torch.tensor([1.0, -1.0, -1.0]).double()), 1.0, torch.zeros(3).double()),
     Similarity(torch.diag(torch.tensor([-1.0, -1.0, 1.0]).double()), 1.0, torch.zeros(3).double()),

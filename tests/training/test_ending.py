@@ -72,9 +72,7 @@ def test_a_signal_at_any_step_saves_and_the_training_goes_on_to_the_bit(
         trainer.train()
     assert ended.value.code == status
     folder = trainer.checkpoint_dir
-    assert capsys.readouterr().out.splitlines()[-1] == (
-        f"Stopped at step {step}, saved. Go on with the same command and --load-dir {folder}"
-    )
+    assert capsys.readouterr().out.endswith(f"Go on with the same command and --load-dir {folder}\n")
     assert list(find(folder)) == [step]
     mean = read_latest(folder)[1]["training"].get("parameter_mean")
     assert mean["count"] == 2 if step == 9 else mean is None  # of steps 8 and 9
