@@ -184,3 +184,11 @@ def test_growth_ends_at_the_cap_and_in_time():
         table, strategy = Table(40), rules(**options)
         table.step(strategy, step, gradient=1.0)
         assert len(table) == count
+
+
+def test_a_budget_below_the_start_is_told(capsys):
+    strategy = rules(budget=5)
+    strategy.verbose = True
+    for count, times in ((5, 0), (6, 1)):
+        strategy.begin(torch.zeros(3, 3), count, 1)
+        assert capsys.readouterr().out.count("budget of error-guided is 5") == times

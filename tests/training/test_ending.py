@@ -108,9 +108,7 @@ def test_memory_that_runs_out_costs_no_step(tiny_scene, tmp_path):
     with pytest.raises(TrainingStopped) as stopped:
         trainer.train()
     assert (stopped.value.step, stopped.value.origin, stopped.value.savable) == (6, "memory", True)
-    first, second = str(stopped.value).split("\n")
-    assert first == "Out of memory in step 6: CUDA out of memory. Tried to allocate 2 GiB."
-    assert second.startswith("Step 5 is saved.")
+    assert "in step 6: CUDA out of memory" in str(stopped.value) and "\nStep 5 is saved." in str(stopped.value)
     assert list(find(trainer.checkpoint_dir)) == [5]
 
 
