@@ -3,6 +3,7 @@ import os
 import signal
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import settings
@@ -84,9 +85,7 @@ def no_cuda(monkeypatch):
     """Make anything that needs CUDA fail: gsplat's compiled kernels, `.cuda()`; and hide a GPU that is there."""
     import torch
 
-    def refuse(*_, **__):
-        raise AssertionError("CUDA was asked for on the CPU path")
-
+    refuse = Mock(side_effect=AssertionError("CUDA was asked for on the CPU path"))
     monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", None)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.Tensor, "cuda", refuse)

@@ -71,16 +71,6 @@ def test_every_switch_builds_and_is_felt(split_bands, opacity_residual, use_dist
     assert torch.allclose(further, colors, atol=1e-12) == (not use_distance)
 
 
-def test_zero_outputs_add_nothing():
-    head = NrfConfig().setup().double()
-    splats, visible, centers = scene(head)
-    appearance, base = head(splats, visible, centers), head.base_appearance(splats, visible)
-    assert torch.equal(appearance.colors, base.colors)
-    assert torch.equal(appearance.opacities, base.opacities)
-    assert head.neutral_loss(splats, visible, centers) == 0.0
-    assert awake(NrfConfig()).neutral_loss(splats, visible, centers) > 0.0
-
-
 def test_straight_through_is_a_clamp_whose_gradient_ignores_it_and_logit_the_residual_at_half_opacity():
     logit = torch.tensor([[-3.0], [0.0], [3.0]], dtype=torch.double)
     residual = torch.tensor([[-1.0], [0.5], [1.0]], dtype=torch.double, requires_grad=True)
@@ -103,13 +93,6 @@ def test_impossible_settings_are_named(field, value):
 
 
 # When the fused kernels are chosen; fused_interpreted.py tests them.
-def test_cpu_takes_torch(monkeypatch):
-    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
-    head = NrfConfig().setup()
-    splats, _, _ = fused_scene(head, 20, 15)
-    assert not head.fused.takes(splats)
-
-
 @pytest.mark.parametrize("interpreted, dtype, sizes, reason", [
     ("0", torch.float32, {}, "the splats are on cpu"),
     ("1", torch.float64, {}, "the splats are not float32"),

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Growth ends before a GPU's memory does: by fake readings, and with `-m gpu` in a process that may take little."""
 
-import sys
 from types import SimpleNamespace
 
 import pytest
@@ -52,14 +51,6 @@ def test_the_estimate(share, free, limit, monkeypatch):
     assert most * 0.009 + 1 <= limit
 
 
-def test_a_cpu_is_not_asked(monkeypatch):
-    table = Table(3)
-    monkeypatch.setattr(torch, "cuda", None)
-    assert memory.most_splats(table.splats, table.optimizers, 0) == sys.maxsize
-    assert memory.allowed(torch.device("cpu")) == 0
-    memory.give_back(torch.device("cpu"))
-
-
 @pytest.mark.parametrize("reserved, times", [(2, 0), (4, 1)])
 def test_memory_is_given_back_where_it_may_be_short(reserved, times, monkeypatch):
     calls = []
@@ -85,11 +76,7 @@ def test_growth_ends_where_memory_does(name, monkeypatch, capsys):
         table.step(followed, REFINES + 200, gradient=1.0)
         table.check()
         assert len(table) == held
-    lines = [line for line in capsys.readouterr().out.splitlines() if "memory" in line]
-    assert lines == [
-        f"Step {REFINES}: growth is held at 41 splats a GPU, since its memory has no room for more. Smaller images or "
-        "more GPUs make room (docs/troubleshooting.md)."
-    ]
+    assert capsys.readouterr().out.count("growth is held at 41 splats") == 1
     monkeypatch.setattr(memory, "allowed", lambda device: 24 * GB)
     table.step(resumed, REFINES + 400, gradient=1.0)
     assert len(table) > 41

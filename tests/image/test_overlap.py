@@ -36,11 +36,9 @@ def photographs(stops, gloss: float = 0.0):
     return viewmats, images
 
 
-def looks_of(stops, gloss: float = 0.0, known=None):
+def looks_of(stops, gloss: float = 0.0):
     """Exposures estimated from photographs with these stops [V, 3]."""
-    pairs = pairs_of(stops, gloss)
-    known = torch.full((len(stops),), UNKNOWN) if known is None else known
-    return estimate(pairs, known, places(len(stops)))
+    return estimate(pairs_of(stops, gloss), torch.full((len(stops),), UNKNOWN), places(len(stops)))
 
 
 def error(looks, stops) -> float:

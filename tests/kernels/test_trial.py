@@ -2,6 +2,7 @@
 """`Gate`: which outcomes of a trial are remembered; trials beside other work. Neither a GPU nor Triton is needed."""
 
 import threading
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -17,29 +18,22 @@ def triton_is_installed(monkeypatch):
     monkeypatch.setattr(trial.importlib.util, "find_spec", lambda name: name)
 
 
-def raises(error: BaseException):
-    def trial(*_, **__):
-        raise error
-
-    return trial
-
-
 def test_an_outcome_is_remembered_and_a_failure_reported_once(caplog, monkeypatch):
     gate = Gate("It")
-    assert gate.find("sound", CPU, lambda: (1, 2)) == gate.find("sound", CPU, raises(OSError())) == (1, 2)
+    assert gate.find("sound", CPU, lambda: (1, 2)) == gate.find("sound", CPU, Mock(side_effect=OSError())) == (1, 2)
     for _ in range(2):
-        assert not gate.opens("broken", CPU, raises(OSError("no compiler\nsearched everywhere")))
+        assert not gate.opens("broken", CPU, Mock(side_effect=OSError("no compiler\nsearched everywhere")))
     assert gate["broken"] == "Triton's kernels do not run here (OSError: no compiler)"
     assert [record.getMessage() for record in caplog.records] == [f"It runs in plain PyTorch on cpu: {gate['broken']}."]
     monkeypatch.setattr(trial.importlib.util, "find_spec", lambda name: None)
-    assert Gate("It").find("key", CPU, raises(AssertionError("tried"))) == "Triton is not installed"
+    assert Gate("It").find("key", CPU, Mock(side_effect=AssertionError("tried"))) == "Triton is not installed"
 
 
 @pytest.mark.parametrize("error", [torch.OutOfMemoryError("CUDA out of memory"), KeyboardInterrupt()])
 def test_what_says_nothing_about_triton_passes_and_is_not_remembered(error, caplog):
     gate = Gate("It")
     with pytest.raises(type(error)):
-        gate.opens("key", CPU, raises(error))
+        gate.opens("key", CPU, Mock(side_effect=error))
     assert gate == {} and not caplog.records
     assert gate.opens("key", CPU, lambda: None)
 
@@ -64,7 +58,9 @@ def test_kernels_are_tried_while_something_else_is_done():
         assert done.wait(20)
         tried.append("all, whatever went wrong before")
 
-    with tried_meanwhile([raises(torch.OutOfMemoryError("no room")), raises(OSError("no compiler")), trial], CPU):
+    with tried_meanwhile(
+        [Mock(side_effect=torch.OutOfMemoryError("no room")), Mock(side_effect=OSError("no compiler")), trial], CPU
+    ):
         assert begun.wait(20), "at the same time"
         done.set()
     assert len(tried) == 1

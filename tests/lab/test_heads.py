@@ -6,16 +6,14 @@ from pathlib import Path
 import pytest
 import torch
 from nerfstudio.utils.eval_utils import eval_setup
-from short_trainings import command_line, set_up, trained
+from short_trainings import command_line, trained
 
 from nrfgs_lab.heads.deferred import DeferredConfig
 from nrfgs_lab.heads.latent_spec import LatentSpecConfig
-from nrfgs_lab.training_run import evaluate
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Compact, Ply, Web
 from nrfgs_ns.model.renderer import Pinhole, composite_view, project_view, projection_options, world_to_camera
-from nrfgs_ns.training.step_graph import StepGraphs
 from nrfgs_ns.viewer.pictures import BASE, DEPTH, FULL, PictureOptions, legends, picture
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -72,29 +70,10 @@ def test_gradients_agree_with_finite_differences(name):
     assert torch.autograd.gradcheck(f, [x.requires_grad_() for x in inputs])
 
 
-def test_it_learns(finished, tiny_scene, tmp_path):
-    """After 60 steps test views are a decibel closer than after one."""
-    method, _ = finished
-    options = {"--pipeline.model.num-downscales": 0}
-    configs = [trained(command_line(method, tiny_scene, tmp_path / str(n), n, options)) for n in (1, 60)]
-    untrained, learnt = (evaluate(config, tmp_path / "eval.json")["psnr"] for config in configs)
-    assert learnt > untrained + 1.0
-
-
 @pytest.mark.parametrize("command", [Ply, Compact, Web])
 def test_exports_refuse(command, finished, tmp_path):
     with pytest.raises(InputError, match="colours pixels.*no file of splats can hold it"):
         command(finished[1], output=tmp_path / "file").main()
-
-
-def test_recorded_steps_refuse(finished, tiny_scene, tmp_path):
-    trainer = set_up(command_line(finished[0], tiny_scene, tmp_path, 1))
-    model = trainer.pipeline.model
-    graphs = StepGraphs(model, trainer.pipeline.datamanager, None)
-    batch = {"image": torch.zeros(36, 48, 3)}
-    assert graphs._obstacle(batch) == "the head's network sees pixels"
-    model.head.at_pixel = False
-    assert graphs._obstacle(batch) is None
 
 
 def test_every_picture_of_the_viewer(finished):

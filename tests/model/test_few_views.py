@@ -19,16 +19,6 @@ def ready(scene, out, steps, *options):
     return set_up(command_line("nrfgs", scene, out, steps, REFINING, *options))
 
 
-def test_the_fewer_the_views_the_less_the_head_is_trusted(tiny_scene, tmp_path, no_cuda, capsys):
-    model = ready(tiny_scene, tmp_path / "few", 1).pipeline.model
-    trust = 8 / 28
-    assert model.num_views == 8 and model.trust == trust
-    assert model.head.config == NrfConfig(opacity_scale=trust * 0.2) and model.noise_factor == 0.5 / trust
-    assert "8 training views: view dependence reduced" in capsys.readouterr().out
-    model = ready(tiny_scene, tmp_path / "many", 1, {"--pipeline.model.few-views": "off"}).pipeline.model
-    assert model.head.config == NrfConfig() and model.noise_factor == 0.5
-
-
 @pytest.fixture
 def twice(tiny_scene, tmp_path):
     """The tiny scene, which has a copy of each training photograph, too."""
@@ -47,7 +37,6 @@ def test_copies_of_photographs_raise_no_trust(twice, tiny_scene, tmp_path, no_cu
     ours = ready(twice, tmp_path / "twice", 0)
     assert "8 different training views of 16: 10,000 steps" in capsys.readouterr().out
     model, single = ours.pipeline.model, ready(tiny_scene, tmp_path / "once", 0).pipeline.model
-    assert "8 training views: 10,000 steps" in capsys.readouterr().out
     assert model.num_train_data == 16 and model.num_views == single.num_views == 8
     assert (model.trust, model.head.config) == (single.trust, single.head.config)
     assert model.noise_factor == single.noise_factor

@@ -2,6 +2,7 @@
 """The mean over a training's last steps: of which steps it is, and when it begins anew. test_ending.py resumes it."""
 
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -178,9 +179,7 @@ def test_what_ends_early_stays_the_last_steps(trainer, monkeypatch):
     assert "stopped before its last step" in end()
     trainer.stop_training = False
 
-    def condemned():
-        raise TrainingStopped("a number", 9, "gradient", savable=False)
-
+    condemned = Mock(side_effect=TrainingStopped("a number", 9, "gradient", savable=False))
     with monkeypatch.context() as patch, pytest.raises(TrainingStopped):
         patch.setattr(trainer.guard, "settle", condemned)
         end()

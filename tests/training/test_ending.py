@@ -7,6 +7,7 @@ import re
 import signal
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -53,13 +54,6 @@ def at_step(trainer: NrfgsTrainer, step: int, then) -> None:
     trainer.pipeline.get_train_loss_dict = spoilt
 
 
-def failing(error: BaseException):
-    def fail(*_):
-        raise error
-
-    return fail
-
-
 @pytest.fixture(scope="module")
 def finished(tiny_scene, tmp_path_factory, any_share) -> Path:
     """config.yml of the unbroken training."""
@@ -78,9 +72,7 @@ def test_a_signal_at_any_step_saves_and_the_training_goes_on_to_the_bit(
         trainer.train()
     assert ended.value.code == status
     folder = trainer.checkpoint_dir
-    assert capsys.readouterr().out.splitlines()[-1] == (
-        f"Stopped at step {step}, saved. Go on with the same command and --load-dir {folder}"
-    )
+    assert capsys.readouterr().out.endswith(f"Go on with the same command and --load-dir {folder}\n")
     assert list(find(folder)) == [step]
     mean = read_latest(folder)[1]["training"].get("parameter_mean")
     assert mean["count"] == 2 if step == 9 else mean is None  # of steps 8 and 9
@@ -101,7 +93,7 @@ def test_ctrl_c_while_images_are_read_is_one_line(tiny_scene, tmp_path, capsys, 
     trainer = parse(command_line("nrfgs", tiny_scene, tmp_path, STEPS)).setup(local_rank=0, world_size=1)
 
     reading = "nrfgs_ns.data.datamanager.NrfgsDatamanager.load_all_images"
-    monkeypatch.setattr(reading, failing(KeyboardInterrupt()))
+    monkeypatch.setattr(reading, Mock(side_effect=KeyboardInterrupt()))
     with pytest.raises(SystemExit) as ended:
         trainer.setup()
     assert ended.value.code == 130 and "Stopped before the first step" in capsys.readouterr().out
@@ -112,13 +104,11 @@ OUT_OF_MEMORY = torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 
 
 def test_memory_that_runs_out_costs_no_step(tiny_scene, tmp_path):
     trainer = ready(tiny_scene, tmp_path)
-    at_step(trainer, 6, failing(OUT_OF_MEMORY))
+    at_step(trainer, 6, Mock(side_effect=OUT_OF_MEMORY))
     with pytest.raises(TrainingStopped) as stopped:
         trainer.train()
     assert (stopped.value.step, stopped.value.origin, stopped.value.savable) == (6, "memory", True)
-    first, second = str(stopped.value).split("\n")
-    assert first == "Out of memory in step 6: CUDA out of memory. Tried to allocate 2 GiB."
-    assert second.startswith("Step 5 is saved.")
+    assert "in step 6: CUDA out of memory" in str(stopped.value) and "\nStep 5 is saved." in str(stopped.value)
     assert list(find(trainer.checkpoint_dir)) == [5]
 
 
@@ -140,8 +130,8 @@ def test_memory_that_runs_out_while_splats_are_added_saves_nothing_half_done(tin
 def test_another_failure_saves_too_and_is_raised(disk_is_full, tiny_scene, tmp_path, monkeypatch, capsys):
     trainer = ready(tiny_scene, tmp_path)
     if disk_is_full:
-        monkeypatch.setattr(checkpoint_files, "write", failing(DiskFull("The disk is full.")))
-    at_step(trainer, 4, failing(BrokenPipeError("the log is gone")))
+        monkeypatch.setattr(checkpoint_files, "write", Mock(side_effect=DiskFull("The disk is full.")))
+    at_step(trainer, 4, Mock(side_effect=BrokenPipeError("the log is gone")))
     with pytest.raises(BrokenPipeError):
         trainer.train()
     assert list(find(trainer.checkpoint_dir)) == ([] if disk_is_full else [3])

@@ -22,19 +22,17 @@ from nrfgs_ns.training.pace import Pace, TimedPace, resolution_phases, steps_for
 LENGTH = 30_000
 
 
-def walk(budget, cost, phases=None, limit=200_000):
+def walk(budget, cost, phases=None):
     """A training whose step at a position costs `cost(position, step)` seconds; the pace, its seconds and positions."""
     now, positions = 100.0, []
     pace = TimedPace(LENGTH, budget, phases, lambda: now)
     pace.start()
-    while len(positions) < limit:
+    while not pace.is_spent:
         pace.begin_step()
         positions.append(pace.position)
         now += cost(pace.position, len(positions))
         pace.advance()
-        if pace.is_spent:
-            return pace, now - 100.0, positions
-    raise AssertionError("training did not end")
+    return pace, now - 100.0, positions
 
 
 @given(

@@ -97,12 +97,15 @@ def assert_same(got, expected) -> None:
         assert (got[2][name] - gradient).norm() <= 1e-4 * gradient.norm() + 1e-9, name
 
 
-@pytest.mark.parametrize(
-    "option, step", [("camera-optimizer.mode SO3xR3", 0), ("robust-loss 0.1", 500), ("robust-loss 0.1", 1999)]
-)
-def test_what_is_not_recorded_is_said_once(build, option, step, capsys, monkeypatch):
-    name, value = option.split()
-    pipeline, graphs = build("cpu", "nrfgs", f"--pipeline.model.{name}", value)
+@pytest.mark.parametrize("words, step", [
+    ("nrfgs --pipeline.model.camera-optimizer.mode SO3xR3", 0),
+    ("nrfgs --pipeline.model.robust-loss 0.1", 500),
+    ("nrfgs --pipeline.model.robust-loss 0.1", 1999),
+    ("nrfgs-deferred", 0),  # its network sees pixels
+    ("nrfgs-latent-spec", 0),
+])  # fmt: skip
+def test_what_is_not_recorded_is_said_once(build, words, step, capsys, monkeypatch):
+    pipeline, graphs = build("cpu", *words.split())
     batch, pipeline.model.step = pipeline.datamanager.train_view(0)[1], step
     monkeypatch.setattr(type(pipeline.model), "device", torch.device("cuda"))
     assert not any(graphs._takes(batch) for _ in range(2))

@@ -79,8 +79,7 @@ def test_an_interrupted_run_ends_with_a_whole_record(tiny_scene, tmp_path, monke
     job = Job(args, {"run": "NRF"}, identity(spec, cell, parser), 8, str(record), str(work), 3, 1)
     train = bench_run.train
 
-    def killed(*_, **__):
-        raise Killed
+    killed = Mock(side_effect=Killed)
 
     def killed_at_5(args, on_save, earlier):
         return train(args, lambda step: killed() if step == 5 else None, on_save, earlier)
