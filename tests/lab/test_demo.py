@@ -30,6 +30,13 @@ def test_demo_trains_compares_and_writes_pictures(tmp_path, capfd, monkeypatch):
     assert all((tmp_path / "demo" / name).stat().st_size > 0 for name in ("contact_sheet.png", "highlight.png"))
 
 
+@pytest.mark.slow
+def test_the_residual_gains_a_decibel_where_it_shines(tmp_path):
+    Demo(out=tmp_path).main()
+    shine = json.loads((tmp_path / "results.json").read_text())["methods"][NRF]["shine"]
+    assert shine["psnr"] > shine["psnr_base"] + 1.0
+
+
 @pytest.mark.parametrize("nrf, sh, steps, says", [
     ([25.0, 25.2, 26.0], [24.0, 24.0, 24.9], ENOUGH_STEPS, "NRF is ahead of SH: +1.10 dB"),
     ([25.0, 25.1, 25.1], [25.0, 25.0, 25.0], ENOUGH_STEPS, "No clear difference"),  # little
