@@ -71,7 +71,7 @@ class PictureOptions:
 
 
 def legends(field: Field) -> dict[str, str]:
-    """The line under the panel's dropdown, for each mode in which a field can be options."""
+    """The line under the panel's dropdown, for each mode in which a field can be shown."""
     means = field.splats["means"]
     with torch.no_grad():
         components = field.head.components(field.splats, means.new_zeros(0, dtype=torch.int64), means.new_zeros(3))
