@@ -156,9 +156,9 @@ SEATS["convolutions at the pixel"] = "nrfgs-latent-spec"
 
 def seats() -> str:
     """Quality, cost and stillness of networks at the splat and at the pixel."""
-    costs, body = records("pixel"), []
+    costs, body = records("numbers"), []
     for run, method in SEATS.items():
-        turns, large = [costs[f"300000/0.4/{method}/{turn}"] for turn in (0, 1)], costs[f"300000/2.0/{method}/0"]
+        turns, large = [costs[f"cost/{method}/0.4/{turn}"] for turn in (0, 1)], costs[f"cost/{method}/2.0/0"]
         small = {name: fmean(one[name] for one in turns) for name in ("step_ms", "1080p", "4K")}
         still = costs[f"flicker/{run}/bonsai"]
         quality = [cell(equal(scene, run)) for scene in (*CURVES, "castle")]
