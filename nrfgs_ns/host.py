@@ -9,6 +9,8 @@ distinguishes gsplat's versions, by `gsplat_version`: nerfstudio 1.1.5 pins 1.4.
 from functools import cache
 from importlib.metadata import version
 
+from packaging.version import Version
+
 NERFSTUDIO = "1.1.5"
 """The version of nerfstudio in which the names below were read."""
 GSPLAT = ("1.4.0", "1.5.3")
@@ -51,4 +53,4 @@ PRIVATE = {
 @cache
 def gsplat_version() -> tuple[int, ...]:
     """Of the installed gsplat, as (1, 4, 0)."""
-    return tuple(int(part) for part in version("gsplat").split("+")[0].split(".")[:3])
+    return Version(version("gsplat")).release

@@ -4,6 +4,11 @@
 The differences between gsplat 1.4.0 and 1.5.3 stay in this file. 1.5.3 has batches; bounds a splat by a rectangle of
 3.33 standard deviations along each axis of the image, where 1.4.0 has a square of 3 along the longest one; names
 images, not cameras; and in the packed layout takes no backgrounds of several images.
+
+gsplat 1.6, read on its main branch in August 2026 and refused until it has been tried: packed projection has another
+column before the radii; `spherical_harmonics` takes means and cameras, not directions; opacity ends at 0.99, not 0.999,
+and antialiasing has a floor, so that `torch_cpu`, the page and the fixtures would differ; numbers of channels without
+compiled kernels raise.
 """
 
 from __future__ import annotations
@@ -23,8 +28,8 @@ if TYPE_CHECKING:  # imports Triton
     from .tile_lists import Room
 
 HAS_BATCHES = gsplat_version() >= (1, 5)
-if HAS_BATCHES and gsplat_version() < (1, 5, 3):
-    raise ImportError(f"gsplat {'.'.join(map(str, gsplat_version()))} is not known here; use {' or '.join(GSPLAT)}.")
+if (installed := ".".join(map(str, gsplat_version()))) not in GSPLAT:
+    raise ImportError(f"gsplat {installed} is not known here; use {' or '.join(GSPLAT)}.")
 
 MOST_CHECKED = 8  # channels that the kernels of `tile_lists.py` check for finite numbers
 MOST_TILES = 2**15  # tiles with a 16-bit number, as `tile_lists.py` needs

@@ -62,11 +62,9 @@ def test_gradients_agree_with_finite_differences(name):
             seen = Field(head, splats).seen_from(view)
             return composite_view(view, seen, background, image_of=head.image_of, look=lambda rgb: rgb)[0]["rgb"]
 
-    drawn = Drawn()
-
     def f(*inputs):
         shared = {f"head.{key}": value for key, value in zip(weights, inputs[len(stored) :], strict=True)}
-        return torch.func.functional_call(drawn, shared, inputs[: len(stored)])
+        return torch.func.functional_call(Drawn(), shared, inputs[: len(stored)])
 
     inputs = [*stored.values(), *(weight.detach().clone() for weight in weights.values())]
     assert torch.autograd.gradcheck(f, [x.requires_grad_() for x in inputs])

@@ -37,8 +37,7 @@ def test_hard_cases(name, dtype):
 @devices
 @pytest.mark.parametrize("name", CASES)
 def test_contributions_to_hard_cases(name, device):
-    """The twin's gradient of the image by a colour; where a cut-off lies within rounding, a share is anything up to
-    1."""
+    """The twin's gradient of the image by a colour; within rounding of a cut-off a share is anything up to 1."""
     case = CASES[name]()
     projecting = ("near_plane", "far_plane", "rasterize_mode")
     case = replace(case, options={name: value for name, value in case.options.items() if name in projecting})

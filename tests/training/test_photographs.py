@@ -96,8 +96,7 @@ TWICE = {"--steps-per-save": 2}
 
 @pytest.fixture(scope="module")
 def finished(exposed_scene, tmp_path_factory):
-    """config.yml of a training of four steps, whose exposures come from the photographs; with the checkpoint of
-    step 2."""
+    """config.yml of a training of four steps with exposures of the photographs; with the checkpoint of step 2."""
     return trained(command_line("nrfgs-sh", exposed_scene[0], tmp_path_factory.mktemp("whole"), 4, QUICK, TWICE))
 
 
