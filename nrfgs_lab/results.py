@@ -6,7 +6,7 @@
 
 {"study": NAME, "records": {path without .json: record}, "texts": {path: lines}}, a line for each record. Numbers have
 seven significant digits, like float32, and numbers of splats are those of every 500 steps. Left out are figures, and
-ns-eval's values of each image where `bench/measure.py` has them.
+each image's values but for `OF_IMAGES` of the test images.
 """
 
 import json
@@ -18,16 +18,23 @@ from nrfgs_ns.files import write_whole
 
 TEXTS = ".md", ".yaml"
 """Endings of text files."""
+OF_IMAGES = "image", "psnr", "ssim", "ms_ssim", "flip"
+"""The values that are kept of each test image; means have all metrics."""
 
 
 def slim(record: Any) -> Any:
-    """A run's record without duplicate values of each image, and with fewer numbers of splats."""
+    """A run's record with fewer values of each image and fewer numbers of splats."""
     if not (isinstance(record, dict) and isinstance(record.get("train"), dict)):
         return record
     train, record = record["train"], dict(record)
     if len(splats := train.get("splats") or []) > 1:
         kept = [pair for pair in splats[:-1] if pair[0] % 500 == 0]
         record["train"] = {**train, "splats": [*kept, splats[-1]]}
+    if measured := record.get("measured"):
+        test, train = measured["test"], measured["train"] or {}
+        images = [{name: image[name] for name in OF_IMAGES if name in image} for image in test["per_image"]]
+        train = {name: value for name, value in train.items() if name != "per_image"} or None
+        record["measured"] = {**measured, "test": {**test, "per_image": images}, "train": train}
     if {"eval", "measured"} <= record.keys():
         record["eval"] = {name: value for name, value in record["eval"].items() if name != "per_image"}
     return record

@@ -138,15 +138,17 @@ def over(other: str) -> str:
 
 
 def first_rule() -> str:
-    """In how many pairs with another rule, at one number on one capture, growth by error is better, and worse."""
+    """In how many pairs with another rule, at one number on one capture, growth by error is better and worse, and in
+    how many its mean SSIM is higher."""
     others = [rule for _, rule in RULES_OF.values() if rule != BY_ERROR]
-    found = []
+    found, higher = [], []
     for scene in CURVES:
         pairs = [(equal(scene, "field", n), equal(scene, "field", n, rule)) for n in COUNTS for rule in others]
         said = [verdict(view_gains(*pair)) for pair in pairs]
+        higher += [gain(*pair, "ssim") > 0 for pair in pairs]
         worse = f", worse in {said.count('worse')}" if "worse" in said else ""
-        found.append(f"{said.count('better')}{worse} of {len(said)} pairs on `{scene}`")
-    return f"better in {', '.join(found)}"
+        found.append(f"{said.count('better')}{worse} of {len(said)} on `{scene}`")
+    return f"better in {', '.join(found)}; its SSIM is higher in {sum(higher)} of {len(higher)}"
 
 
 SEATS = {"field": "nrfgs", "harmonics": "nrfgs-sh", "network at the pixel": "nrfgs-deferred"}

@@ -32,6 +32,7 @@ def test_demo_trains_compares_and_writes_pictures(tmp_path, capfd, monkeypatch):
 
 @pytest.mark.slow
 def test_the_residual_gains_a_decibel_where_it_shines(tmp_path):
+    """Three seeds gained 2.6 to 3.5 dB (results/demo.json): 1 dB is three of their deviations below the least."""
     Demo(out=tmp_path).main()
     shine = json.loads((tmp_path / "results.json").read_text())["methods"][NRF]["shine"]
     assert shine["psnr"] > shine["psnr_base"] + 1.0

@@ -73,8 +73,8 @@ def test_an_average_is_of_rows_that_have_all_scenes():
 def test_a_folder_comes_back(tmp_path):
     folder = tmp_path / "out"
     (folder / "runs").mkdir(parents=True)
-    image = [{"image": "a.png", "psnr": 30.123456789}]
-    run = {"eval": {"psnr": 1 / 3, "per_image": image}, "measured": {"test": {"per_image": image}}, "splats": 123456789}
+    scores = {"psnr": 1 / 3, "per_image": [{"image": "a.png", "psnr": 30.123456789, "l1": 0.1}]}
+    run = {"eval": scores, "measured": {"test": scores, "train": scores}, "splats": 123456789}
     run["train"] = {"splats": [[step, 10 * step] for step in range(0, 1101, 100)] + [[1149, 7]]}
     (folder / "runs" / "one.json").write_text(json.dumps(run))
     (folder / "table.md").write_text("| a |\n|---|\n")
@@ -83,7 +83,7 @@ def test_a_folder_comes_back(tmp_path):
     assert (tmp_path / "again" / "table.md").read_text() == "| a |\n|---|\n"
     found = json.loads((tmp_path / "again" / "runs" / "one.json").read_text())
     assert found["train"]["splats"] == [[0, 0], [500, 5000], [1000, 10000], [1149, 7]]
-    assert found["eval"] == {"psnr": 0.3333333} and found["splats"] == 123456789
+    assert found["eval"] == found["measured"]["train"] == {"psnr": 0.3333333} and found["splats"] == 123456789
     assert found["measured"]["test"]["per_image"] == [{"image": "a.png", "psnr": 30.12346}]
 
 
