@@ -155,9 +155,9 @@ def composite(
     if with_depth:
         render = torch.cat([render[..., :-1], render[..., -1:] / alphas.clamp(min=1e-10)], dim=-1)
     kept = "camera_ids", "gaussian_ids", "radii", "means2d", "depths", "conics", "width", "height", "n_cameras"
-    info = {name: getattr(projection, name) for name in kept} | {"opacities": opacities, "tile_size": TILE_SIZE}
-    info |= {f"tile_{side}": -(-info[side] // TILE_SIZE) for side in ("width", "height")}
-    return render, alphas, info | lists
+    info = {name: getattr(projection, name) for name in kept} | {"opacities": opacities, "tile_size": TILE_SIZE} | lists
+    info |= {f"tile_{side}": -(-info[side] // info["tile_size"]) for side in ("width", "height")}
+    return render, alphas, info
 
 
 def contributions(projection: Projection, opacities: Tensor) -> Tensor:

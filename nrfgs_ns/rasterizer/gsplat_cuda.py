@@ -33,6 +33,7 @@ if (installed := ".".join(map(str, gsplat_version()))) not in GSPLAT:
 
 MOST_CHECKED = 8  # channels that the kernels of `tile_lists.py` check for finite numbers
 MOST_TILES = 2**15  # tiles with a 16-bit number, as `tile_lists.py` needs
+SMALL_TILE = 8  # pixels: side of the tiles of images with gradients, which go through the lists twice
 
 
 def load_kernels(device: torch.device) -> None:
@@ -132,20 +133,22 @@ def composite(
     behind = backgrounds
     if HAS_BATCHES and behind is not None:  # its check knows one image only, and sends that one no gradient
         behind = behind[0] if len(behind) == 1 and not behind.requires_grad else None
-    shape = projection.width, projection.height, TILE_SIZE
     tables = projection.means2d, projection.conics, colors, opacities
-    room = None
+    side, room = TILE_SIZE, None
     if len(opacities) > 0 and _kernels_take(projection, opacities):
         from .tile_lists import room_on
 
         room = room_on(opacities.device)
+        if torch.is_grad_enabled() and _tiles(projection, SMALL_TILE) <= MOST_TILES:
+            side = SMALL_TILE
+    shape = projection.width, projection.height, side
     while True:
-        lists = _lists(projection, opacities, room, colors if leave_out else None)
+        lists = _lists(projection, opacities, side, room, colors if leave_out else None)
         render, alphas = rasterize_to_pixels(*tables, *shape, *lists, backgrounds=behind, packed=True, absgrad=absgrad)
         if backgrounds is not None and behind is None:
             render = render + (1.0 - alphas) * backgrounds[:, None, None]
         if room is None or room.was_enough():
-            return render, alphas, {"isect_offsets": lists[0], "flatten_ids": lists[1]}
+            return render, alphas, {"isect_offsets": lists[0], "flatten_ids": lists[1], "tile_size": side}
 
 
 def leaves_out(projection: Projection, colors: Tensor, opacities: Tensor) -> bool:
@@ -155,15 +158,16 @@ def leaves_out(projection: Projection, colors: Tensor, opacities: Tensor) -> boo
 
 
 def _lists(
-    projection: Projection, opacities: Tensor, room: Room | None, finite: Tensor | None
+    projection: Projection, opacities: Tensor, side: int, room: Room | None, finite: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """Offsets into a list of rows, and the list: the splats that each tile draws, as gsplat's kernels take them.
 
     Args:
+        side: of a tile, in pixels.
         room: for the kernels of `tile_lists.py`; None: gsplat makes the lists.
         finite: colours [M, D]; rows that are not finite, in these or otherwise, are left out.
     """
-    tile_width, tile_height = -(-projection.width // TILE_SIZE), -(-projection.height // TILE_SIZE)
+    tile_width, tile_height = -(-projection.width // side), -(-projection.height // side)
     bounds = projection.radii
     if HAS_BATCHES:
         extents = projection.extents  # a square where another device has projected them
@@ -174,11 +178,11 @@ def _lists(
 
         tables = (table.detach().contiguous() for table in (means2d, bounds, depths, conics, opacities))
         colors = None if finite is None else finite.detach().contiguous()
-        return tile_lists(*tables, tile_width, tile_height, TILE_SIZE, colors, room)
+        return tile_lists(*tables, tile_width, tile_height, side, colors, room)
     images = {"n_cameras": projection.n_cameras, "camera_ids": projection.camera_ids}
     if HAS_BATCHES:
         images = {"n_images": projection.n_cameras, "image_ids": projection.camera_ids}
-    tables, tiles = (means2d, bounds, depths), (TILE_SIZE, tile_width, tile_height)
+    tables, tiles = (means2d, bounds, depths), (side, tile_width, tile_height)
     rows = {"gaussian_ids": projection.gaussian_ids, **images}
     _, isect_ids, flatten_ids = isect_tiles(*tables, *tiles, packed=True, **rows)
     return isect_offset_encode(isect_ids, projection.n_cameras, tile_width, tile_height), flatten_ids
@@ -186,13 +190,17 @@ def _lists(
 
 def _kernels_take(projection: Projection, opacities: Tensor) -> bool:
     """Whether the kernels of `tile_lists.py` make the lists."""
-    tiles = -(-projection.width // TILE_SIZE) * (-(-projection.height // TILE_SIZE) + 1)
     return (
         projection.n_cameras == 1
-        and tiles <= MOST_TILES
+        and _tiles(projection, TILE_SIZE) <= MOST_TILES
         and opacities.dtype == projection.means2d.dtype == torch.float32
         and _kernels_run_on(opacities.device)
     )
+
+
+def _tiles(projection: Projection, side: int) -> int:
+    """Tiles of an image and of the row below it."""
+    return -(-projection.width // side) * (-(-projection.height // side) + 1)
 
 
 @tried_once("The list of each tile's splats")
@@ -202,4 +210,5 @@ def _kernels_run_on(device: torch.device) -> None:
 
     ones = torch.ones(1, 3, device=device)
     radii = torch.ones(1, 2, dtype=torch.int32, device=device) if HAS_BATCHES else ones[0, :1].int()
-    tile_lists(ones[:, :2].contiguous(), radii, ones[0, :1], ones, ones[0, :1], 1, 1, TILE_SIZE)
+    for side in (SMALL_TILE, TILE_SIZE):
+        tile_lists(ones[:, :2].contiguous(), radii, ones[0, :1], ones, ones[0, :1], 1, 1, side)

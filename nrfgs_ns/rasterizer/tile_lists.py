@@ -6,7 +6,9 @@ gsplat lists a splat in every tile of the square of three standard deviations ar
     opacity exp(-sigma) < 1 / 255        sigma = 1/2 (a dx^2 + c dy^2) + b dx dy,  (a, b, c) the conic.
 
 Here a splat is listed in those tiles of its square that have a pixel's centre in that ellipse (Feng et al., FlashGS,
-and Hanson et al., Speedy-Splat, 2024). Images and gradients are gsplat's.
+and Hanson et al., Speedy-Splat, 2024). Images and gradients are gsplat's, also with tiles of half its side: the square
+is made of its tiles. They have shorter lists, of which the longest decides how long the drawing kernels take, and which
+all pixels of a tile go through.
 
 An ellipse meets a row of tiles in one interval of columns, which ends at the ellipse's own leftmost and rightmost
 points, or, where these lie outside the row's band, on the band's nearer edge.
@@ -29,10 +31,14 @@ from torch import Tensor
 
 from nrfgs_ns.kernels.launch import Launcher
 
+from . import TILE_SIZE
+
 SPLATS = 64
 """Splats whose tiles one program counts; a power of two."""
 PAIRS = 256
 """Pairs of a splat and a tile that one program lists; a power of two."""
+GSPLATS = tl.constexpr(TILE_SIZE)
+"""Side of gsplat's tiles in pixels."""
 
 SLACK = tl.constexpr(0.02)
 """Added to the bound of sigma, for the rounding of the drawing kernels."""
@@ -57,14 +63,15 @@ def _ellipse(means2d, conics, opacities, rows, valid):
 
 @triton.jit
 def _box(x, y, radii, rows, valid, width, height, SIDE: tl.constexpr, RADII: tl.constexpr):
-    """Gsplat's tiles of a splat: first and end of columns and rows."""
-    center_x, center_y = x / SIDE, y / SIDE
-    reach_x = tl.load(radii + rows * RADII, mask=valid, other=0).to(tl.float32) / SIDE
-    reach_y = tl.load(radii + rows * RADII + (RADII - 1), mask=valid, other=0).to(tl.float32) / SIDE
-    left = tl.minimum(tl.maximum(tl.floor(center_x - reach_x), 0.0), width).to(tl.int32)
-    top = tl.minimum(tl.maximum(tl.floor(center_y - reach_y), 0.0), height).to(tl.int32)
-    right = tl.minimum(tl.maximum(tl.ceil(center_x + reach_x), 0.0), width).to(tl.int32)
-    bottom = tl.minimum(tl.maximum(tl.ceil(center_y + reach_y), 0.0), height).to(tl.int32)
+    """The tiles inside gsplat's tiles of a splat: first and end of columns and rows."""
+    SHARE: tl.constexpr = GSPLATS // SIDE
+    center_x, center_y = x / GSPLATS, y / GSPLATS
+    reach_x = tl.load(radii + rows * RADII, mask=valid, other=0).to(tl.float32) / GSPLATS
+    reach_y = tl.load(radii + rows * RADII + (RADII - 1), mask=valid, other=0).to(tl.float32) / GSPLATS
+    left = tl.minimum(tl.maximum(tl.floor(center_x - reach_x) * SHARE, 0.0), width).to(tl.int32)
+    top = tl.minimum(tl.maximum(tl.floor(center_y - reach_y) * SHARE, 0.0), height).to(tl.int32)
+    right = tl.minimum(tl.maximum(tl.ceil(center_x + reach_x) * SHARE, 0.0), width).to(tl.int32)
+    bottom = tl.minimum(tl.maximum(tl.ceil(center_y + reach_y) * SHARE, 0.0), height).to(tl.int32)
     return left, top, right, tl.where(reach_x > 0.0, bottom, top)
 
 
@@ -252,7 +259,7 @@ def tile_lists(
         radii: half the sides, in pixels, of the boxes that bound the splats: of squares [M] or of rectangles [M, 2].
         opacities: as composited, compensation included, [M].
         width, height: image size in tiles; with the row below, at most 2^15 tiles.
-        side: side of a tile in pixels.
+        side: side of a tile in pixels, `TILE_SIZE` or a part of it.
         colors: [M, D]; splats that are not finite, in these or otherwise, are left out. None: no check.
         room: makes room for its number of pairs and is sent the actual one; None: wait for the number.
 

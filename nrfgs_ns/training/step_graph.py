@@ -169,10 +169,9 @@ class StepGraphs:
         for graph in self._graphs.values():
             self._pairs_for_each = max(self._pairs_for_each, graph.most_pairs() / graph.count)
 
-    @torch.no_grad()
     def _most_pairs(self) -> int:
-        """The most pairs of any of `VIEWS_ASKED` views; RuntimeError where gsplat makes the lists, not
-        `tile_lists.py`."""
+        """The most pairs of any of `VIEWS_ASKED` views in the tiles of images with gradients; RuntimeError where gsplat
+        makes the lists, not `tile_lists.py`."""
         from nrfgs_ns.rasterizer.tile_lists import FixedRoom
 
         model, count = self.model, len(self.datamanager.train_dataset)

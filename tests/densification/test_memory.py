@@ -132,7 +132,7 @@ def test_growth_is_held_in_a_small_share_of_a_card(name, tiny_scene, tmp_path, c
     options = {
         "splatfacto": {"densify_grad_thresh": 0.0},
         "mcmc": {"budget": 2**24, "refine_every": 2},  # grows by 5 % at most
-        "error-guided": {"budget": 10**7, "most_splats": 10**7, "refine_every": 5},  # doubles at most
+        "error-guided": {"budget": 10**7, "most_splats": 10**7, "warmup_length": 0, "refine_every": 30},
     }
     args = arguments(tiny_scene, tmp_path, name, 800, **options.get(name, {}))
     trainer = set_up(args)

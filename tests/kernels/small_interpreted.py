@@ -12,6 +12,7 @@ from nrfgs_ns.densification.statistics import add_in_torch, raise_in_torch
 from nrfgs_ns.densification.statistics_triton import add, raise_maxima
 from nrfgs_ns.image import ssim_triton
 from nrfgs_ns.image.ssim import photometric_loss
+from nrfgs_ns.rasterizer import TILE_SIZE
 from nrfgs_ns.rasterizer.tile_lists import tile_lists
 
 
@@ -70,16 +71,18 @@ def test_the_kernel_raises_what_its_twin_raises(grows, peak, visible):
 
 
 # The tiles' lists, against every pixel of every tile.
-def test_tiles_list_what_draws_in_them():
+@pytest.mark.parametrize("side", [8, 16])
+def test_tiles_list_what_draws_in_them(side):
     of = splats(200, 100, 70)
-    lists = tile_lists(*of, 7, 5, 16)
-    assert assert_lists(*lists, of, 7, 5, 16) <= 0.1 * len(lists[1])
+    shape = -(-100 // side), -(-70 // side), side
+    lists = tile_lists(*of, *shape)
+    assert assert_lists(*lists, of, *shape, TILE_SIZE) <= 0.1 * len(lists[1])
 
 
 def test_rectangles_bound_splats():
     of = splats(60, 60, 40, seed=1)
     of = of._replace(radii=torch.stack([of.radii, (of.radii + 1) // 2], dim=1))
-    assert_lists(*tile_lists(*of, 8, 5, 8), of, 8, 5, 8)
+    assert_lists(*tile_lists(*of, 8, 5, 8), of, 8, 5, 8, TILE_SIZE)
 
 
 def test_splats_that_are_long_far_off_or_no_ellipses():
