@@ -142,6 +142,12 @@ def sparse() -> str:
     return grid(["training views", "`nrfgs`", "harmonics", "`nrfgs` against harmonics", "3DGS, published"], body)
 
 
+def by_views() -> str:
+    """Mean gain over harmonics with few of `bonsai`'s views, of the seeds that both have."""
+    gains = {views: fmean(view_gains(*sparse_runs(f"{views}_views_bonsai"))) for views in (16, 24, 32)}
+    return ", ".join(f"{signed(gain)} dB with {views}" for views, gain in gains.items())
+
+
 BLOCKS = {
     "readme.captures": captures,
     "readme.over_host_where_seen": over_host_where_seen,
@@ -151,5 +157,6 @@ BLOCKS = {
     "captures.floaters": floaters,
     "captures.today": summary,
     "captures.sparse": sparse,
+    "captures.by_views": by_views,
     "captures.run": lambda name: _run(records("trials")[name]),
 }

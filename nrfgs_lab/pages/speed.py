@@ -64,9 +64,10 @@ def scale_ratios() -> str:
     return " ".join(parts)
 
 
-def scale_fit(column: str, factor: str, unit: str, renderer: str) -> str:
-    """Least squares of a quantity by splats and pixels."""
-    cells = {place: float(factor) * median(cells[renderer]) for place, cells in scale_cells(column).items()}
+def scale_fit(column: str, factor: str, unit: str, renderer: str, most: str = "inf") -> str:
+    """Least squares of a quantity by splats and pixels, with at most as many millions of splats."""
+    places = {place: cells[renderer] for place, cells in scale_cells(column).items() if place[0] <= 1e6 * float(most)}
+    cells = {place: float(factor) * median(values) for place, values in places.items()}
     parts = np.linalg.lstsq([[1, count / 1e6, pixels] for count, pixels in cells], [*cells.values()], rcond=None)[0]
     return f"{parts[0]:.1f} {unit}, {parts[1]:.1f} for each million splats and {parts[2]:.2f} for each megapixel"
 

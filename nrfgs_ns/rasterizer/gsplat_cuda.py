@@ -32,7 +32,7 @@ if (installed := ".".join(map(str, gsplat_version()))) not in GSPLAT:
     raise ImportError(f"gsplat {installed} is not known here; use {' or '.join(GSPLAT)}.")
 
 MOST_CHECKED = 8  # channels that the kernels of `tile_lists.py` check for finite numbers
-MOST_TILES = 2**15  # tiles with a 16-bit number, as `tile_lists.py` needs
+MOST_TILES = 2**16  # tiles with a 16-bit number, as `tile_lists.py` needs
 SMALL_TILE = 8  # pixels: side of the tiles of images with gradients, which go through the lists twice
 
 

@@ -39,6 +39,8 @@ PAIRS = 256
 """Pairs of a splat and a tile that one program lists; a power of two."""
 GSPLATS = tl.constexpr(TILE_SIZE)
 """Side of gsplat's tiles in pixels."""
+FIRST = tl.constexpr(-(2**15))
+"""The first tile's number."""
 
 SLACK = tl.constexpr(0.02)
 """Added to the bound of sigma, for the rounding of the drawing kernels."""
@@ -164,7 +166,7 @@ def list_kernel(
         tile = tl.where(here, row * width + first + left_over, tile)
         left_over = tl.where(here, -1, left_over - tl.where(left_over >= 0, end - first, 0))
         row += 1
-    tl.store(tiles + at, tile.to(tl.int16), mask=valid)
+    tl.store(tiles + at, (tile + FIRST).to(tl.int16), mask=valid)
     tl.store(splats + at, rows.to(tl.int32), mask=valid)
 
 
@@ -258,7 +260,7 @@ def tile_lists(
         means2d, depths, conics: a `Projection`'s, M >= 1 rows.
         radii: half the sides, in pixels, of the boxes that bound the splats: of squares [M] or of rectangles [M, 2].
         opacities: as composited, compensation included, [M].
-        width, height: image size in tiles; with the row below, at most 2^15 tiles.
+        width, height: image size in tiles; with the row below, at most 2^16 tiles.
         side: side of a tile in pixels, `TILE_SIZE` or a part of it.
         colors: [M, D]; splats that are not finite, in these or otherwise, are left out. None: no check.
         room: makes room for its number of pairs and is sent the actual one; None: wait for the number.
@@ -296,6 +298,6 @@ def tile_lists(
 
 @cache  # for good: recorded steps read it
 def _numbers(count: int, device: torch.device) -> Tensor:
-    """0 to count - 1."""
+    """Of the first `count` tiles."""
     with torch.inference_mode(False):  # they outlive a rendering that records nothing
-        return torch.arange(count, dtype=torch.int16, device=device)
+        return torch.arange(FIRST.value, FIRST.value + count, dtype=torch.int16, device=device)

@@ -79,6 +79,14 @@ def test_tiles_list_what_draws_in_them(side):
     assert assert_lists(*lists, of, *shape, TILE_SIZE) <= 0.1 * len(lists[1])
 
 
+def test_the_most_tiles():
+    """A splat in the last tile of row 249, of 256 with the row below the image."""
+    one = torch.ones(1)
+    of = Splats(torch.tensor([[2044.0, 1996.0]]), one.int(), one, torch.tensor([[1.0, 0.0, 1.0]]), one)
+    begins, rows = tile_lists(*of, 256, 255, 8)
+    assert begins.flatten().tolist() == [0] * 250 * 256 + [1] * 6 * 256 and rows.tolist() == [0]
+
+
 def test_rectangles_bound_splats():
     of = splats(60, 60, 40, seed=1)
     of = of._replace(radii=torch.stack([of.radii, (of.radii + 1) // 2], dim=1))
