@@ -40,7 +40,8 @@ class Bench:
     """Compare methods over strategies, scenes and seeds: train all, and report. See docs/bench.md."""
 
     spec: Annotated[Path, tyro.conf.Positional]
-    """YAML file with runs or knobs, strategies, scenes, seeds, ...; options given here override it"""
+    """YAML file with runs or knobs, strategies, scenes, seeds, ..., or a name: captures, exposure, methods, opacity,
+    pixel, tiny or tradeoff; options given here override it"""
     plan: str = ""
     """the plan to run, of a file with several"""
     scenes: Path = Path(".")

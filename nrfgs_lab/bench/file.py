@@ -32,6 +32,8 @@ SET_HERE = {
     "--machine.seed": "use seeds",
 }
 """Options of ns-train that the benchmark sets -> what to use instead."""
+PLANS = Path(__file__).parent / "plans"
+"""The files that the package has."""
 NO_KEYS = {Method: ("name",), Scene: ("held_out", "held_out_every", "held_out_by")}
 """Fields that a file does not give."""
 LISTS = "strategies", "seeds", "held_out"
@@ -56,7 +58,12 @@ class _Loader(yaml.SafeLoader):
 
 
 def load_spec(path: Path, plan: str = "") -> dict[str, Any]:
-    """Content of a YAML file, or of one of its `plans`, for `make_spec`; InputError if it cannot be read."""
+    """Content of a YAML file, or of one of its `plans`, for `make_spec`; InputError if it cannot be read.
+
+    Where there is no such file, the path may be the name of one in `PLANS`.
+    """
+    shipped = PLANS / f"{path}.yaml"
+    path = shipped if shipped.is_file() and not path.is_file() else path
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:

@@ -166,14 +166,14 @@ def _lpips(pred: Tensor, gt: Tensor, mask: Tensor | None) -> float | None:
 @functools.cache
 def _lpips_net() -> torch.nn.Module | str:
     """Torchmetrics' LPIPS network if its AlexNet weights are on disk, else how to get them."""
-    # These imports cost seconds, and only evaluation needs them.
-    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
     from torchvision.models import AlexNet_Weights
 
     url = AlexNet_Weights.DEFAULT.url
     path = os.path.join(torch.hub.get_dir(), "checkpoints", os.path.basename(url))
     problem = f"{path} is missing"
     if os.path.isfile(path):
+        from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity  # takes seconds
+
         try:
             # The bare network: the metric around it would keep every score it ever gave.
             return LearnedPerceptualImagePatchSimilarity(net_type="alex", normalize=True).net

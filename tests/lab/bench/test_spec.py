@@ -13,7 +13,7 @@ from PIL import ExifTags, Image
 from small_colmap import Model
 
 from nrfgs_lab.bench.data import held_out_views, parser_options
-from nrfgs_lab.bench.file import load_spec, make_spec
+from nrfgs_lab.bench.file import PLANS, load_spec, make_spec
 from nrfgs_lab.bench.job import command, differences, identity, settings
 from nrfgs_lab.bench.spec import PRESET_STEPS, Scene, Spec, cells_of, steps_of
 from nrfgs_lab.pages.methods import HEADS, best_trial
@@ -23,7 +23,6 @@ from nrfgs_ns.data.pictures import read_exif
 from nrfgs_ns.densification import ErrorGuided, Mcmc
 from nrfgs_ns.errors import InputError
 
-ROOT = Path(__file__).resolve().parents[3]
 SMALL = {"runs": {"SH": "nrfgs-sh", "NRF": "nrfgs"}, "scenes": ["bonsai"]}
 
 
@@ -35,9 +34,9 @@ def spec(**more):
 def plans() -> dict[tuple[str, str], Spec]:
     """Each plan of the shipped files, by file and name."""
     result = {}
-    for file in sorted((ROOT / "docs" / "bench").glob("*.yaml")):
+    for file in sorted(PLANS.glob("*.yaml")):
         for name in yaml.safe_load(file.read_text()).get("plans", [""]):
-            result[file.stem, name] = make_spec(load_spec(file, name), file.name)
+            result[file.stem, name] = make_spec(load_spec(Path(file.stem), name), file.name)
     return result
 
 
