@@ -13,6 +13,8 @@ from nrfgs_lab.pages.runs import VIEWS, Trainings, grid, mean, records, signed, 
 FIELD, HOST, SAME = "nrfgs", "splatfacto", "harmonics, same rules"
 SHRUNK = "harmonics, same steps and shrinkage"
 FEW = list(VIEWS)[1:]
+FEWER = 16, 24, 32
+"""Numbers of `bonsai`'s views in results/twenty-four.json."""
 SPARSE = {"24_views_bonsai": (24, "22.60"), "kitchen": (21, "19.24 (other views)")}
 """Scene of results/twenty-four.json -> training views, and 3DGS's PSNR with 24 at one eighth of the size, from other
 implementations (arXiv 2508.04968)."""
@@ -53,8 +55,8 @@ def captures() -> str:
     for scene, views in VIEWS.items():
         field, host = today(scene, FIELD), runs_of(scene, HOST)
         gains = view_gains(field, today(scene, SAME))
-        body.append([f"{scene}, {views}", cell(field), cell(host), f"{verdict(gains)}: {ahead(gains)}"])
-    return grid(["capture, training views", "`nrfgs`", "splatfacto", "`nrfgs` against harmonics"], body)
+        body.append([f"{scene}, {views}", f"{cell(field)}; {cell(host)}", f"{verdict(gains)}: {ahead(gains)}"])
+    return grid(["capture, training views", "`nrfgs`; splatfacto", "`nrfgs` against harmonics"], body)
 
 
 def over_host_where_seen() -> str:
@@ -144,7 +146,7 @@ def sparse() -> str:
 
 def by_views() -> str:
     """Mean gain over harmonics with few of `bonsai`'s views, of the seeds that both have."""
-    gains = {views: fmean(view_gains(*sparse_runs(f"{views}_views_bonsai"))) for views in (16, 24, 32)}
+    gains = {views: fmean(view_gains(*sparse_runs(f"{views}_views_bonsai"))) for views in FEWER}
     return ", ".join(f"{signed(gain)} dB with {views}" for views, gain in gains.items())
 
 

@@ -8,9 +8,10 @@ import math
 from functools import partial
 from statistics import median
 
-from nrfgs_lab.pages.few_views import FIELD, SAME, sparse_runs, today
+from nrfgs_lab.pages.few_views import FEWER, FIELD, SAME, sparse_runs, today
 from nrfgs_lab.pages.methods import COUNTS, CURVES, HEADS_OF, RULES_OF, SEATS_OF, Labels, equal
-from nrfgs_lab.pages.runs import ROOT, VIEWS, view_gains
+from nrfgs_lab.pages.runs import ROOT, VIEWS, bench_rows, mean_of, records, view_gains
+from nrfgs_lab.pages.speed import PRESETS
 from nrfgs_ns.files import write_whole
 
 WIDTH, LEFT, ROW = 640, 130, 34
@@ -20,10 +21,15 @@ STYLE = """text { font: 15px sans-serif; fill: #1f2328 } .rule { stroke: #59636e
 .better { fill: #4493f8 } .worse { fill: #db6d28 } }"""
 
 
+def svg(height: float, parts: list[str]) -> str:
+    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}">\n<style>{STYLE}</style>'
+    return "\n".join([head, *parts, "</svg>", ""])
+
+
 def views() -> str:
     """Gain of the field over harmonics with the same rules in each test view, a dot each; bars are medians."""
     rows = {(views, scene): (today(scene, FIELD), today(scene, SAME)) for scene, views in VIEWS.items()}
-    rows[24, "bonsai"] = sparse_runs("24_views_bonsai")
+    rows |= {(views, "bonsai"): sparse_runs(f"{views}_views_bonsai") for views in FEWER}
     gains = {f"{scene}, {views}": view_gains(*rows[views, scene]) for views, scene in sorted(rows, reverse=True)}
     least, most = (math.floor(min(map(min, gains.values()))), math.ceil(max(map(max, gains.values()))))
     height = ROW * len(gains) + 50
@@ -44,8 +50,7 @@ def views() -> str:
         f'<text x="{x(g)}" y="{height - 25}" text-anchor="middle">{g:+d}</text>'.replace("+0", "0") for g in ticks
     ]
     parts.append(f'<text x="{(LEFT + WIDTH) / 2}" y="{height - 5}" text-anchor="middle">field - harmonics, dB</text>')
-    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}">\n<style>{STYLE}</style>'
-    return "\n".join([head, *parts, "</svg>", ""])
+    return svg(height, parts)
 
 
 LINES = "#0969da", "#bc4c00", "#1a7f37", "#8250df", "#bf3989", "#808890"
@@ -68,8 +73,7 @@ def curves(labels: Labels, metrics: tuple[str, ...] = ("psnr",)) -> str:
         parts.append(f'<line stroke="{colour}" stroke-width="4" x1="{x}" x2="{x + 26}" y1="{y - 5}" y2="{y - 5}"/>')
         parts.append(f'<text x="{x + 34}" y="{y}">{label}</text>')
     height = top + 22 * -(-len(labels) // 2)
-    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}">\n<style>{STYLE}</style>'
-    return "\n".join([head, *parts, "</svg>", ""])
+    return svg(height, parts)
 
 
 def panel(labels: Labels, scene: str, metric: str, left: float, top: float) -> list[str]:
@@ -100,8 +104,36 @@ def panel(labels: Labels, scene: str, metric: str, left: float, top: float) -> l
     return parts
 
 
+def seconds() -> str:
+    """PSNR over seconds of `bonsai`'s trainings, alone on a GPU: before growth by error, and today's, filled."""
+    rows = {run: bench_rows("speed").get(("bonsai", "own", run)) for run in PRESETS}
+    dots = {run: (median(row.values["time s"].values()), mean_of(row, "PSNR")) for run, row in rows.items() if row}
+    one = records("trials")["one host: nrfgs/bonsai-42"]
+    dots["today's nrfgs"] = one["seconds"], one["psnr"]
+
+    def at(time: float, value: float) -> tuple[float, float]:
+        x = 45 + math.log(time / 10) / math.log(40) * (WIDTH - 75)
+        return round(x, 1), round(20 + (36 - value) * HIGH / 5, 1)
+
+    parts = []
+    for value in range(31, 37):
+        (left, y), (right, _) = at(10, value), at(400, value)
+        parts.append(f'<line class="faint" x1="{left}" x2="{right}" y1="{y}" y2="{y}"/>')
+        parts.append(f'<text x="{left - 8}" y="{y + 5}" text-anchor="end">{value}</text>')
+    for time in (10, 20, 50, 100, 200, 400):
+        x, y = at(time, 31)
+        parts.append(f'<text x="{x}" y="{y + 22}" text-anchor="middle">{time} s</text>')
+    for label, (time, value) in dots.items():
+        (x, y), filled = at(time, value), 1 if label not in PRESETS else 0.3
+        beside, anchor = (-10, "end") if time > 150 else (10, "start")
+        parts.append(f'<circle class="better" fill-opacity="{filled}" cx="{x}" cy="{y}" r="6"/>')
+        parts.append(f'<text x="{x + beside}" y="{y + 5}" text-anchor="{anchor}">{label}</text>')
+    return svg(HIGH + 50, parts)
+
+
 FIGURES = {
     "views.svg": views,
+    "seconds.svg": seconds,
     "heads.svg": partial(curves, HEADS_OF),
     "rules.svg": partial(curves, RULES_OF, ("psnr", "ssim")),
     "seats.svg": partial(curves, SEATS_OF),

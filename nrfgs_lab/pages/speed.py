@@ -6,38 +6,10 @@ from statistics import median
 
 import numpy as np
 
-from nrfgs_lab.pages.runs import VIEWS, bench_rows, grid, mean_of, records, span
+from nrfgs_lab.pages.runs import records, span
 
-# The choice between methods and presets.
-
-CAPTURES = "bonsai", "fox"
-PRESETS = {
-    "splatfacto": "splatfacto",
-    "splatfacto-big": "splatfacto-big",
-    **{run: f"`{run}`" for run in ("nrfgs-sh", "nrfgs-fast", "nrfgs", "nrfgs-best")},
-}
-
-
-def _preset(scene: str, run: str) -> str:
-    """A run's cell, with a mark if it was made on another day than most."""
-    row, mark = bench_rows("speed").get((scene, "own", run)), ""
-    if row is None and run.startswith("splatfacto"):
-        row, mark = bench_rows("presets").get((scene, "own", f"nerfstudio_{run}")), "*"
-    if row is None and run == "nrfgs":  # it chooses 10,000 steps, and is the preset
-        row = bench_rows("speed").get((scene, "own", "nrfgs-fast"))
-    if row is None:
-        return "-"
-    seconds = list(row.values["time s"].values())
-    time = f", {span(seconds, '{:.0f}'.format)} s" if seconds else ""
-    splats = f"{mean_of(row, 'splats') / 1000:.0f}k"
-    return f"{mean_of(row, 'PSNR'):.2f}/{mean_of(row, 'SSIM'):.3f}, {splats}{time}{mark}"
-
-
-def presets() -> str:
-    """PSNR, SSIM, splats and seconds of a user's choices."""
-    body = [[label, *(_preset(scene, run) for scene in CAPTURES)] for run, label in PRESETS.items()]
-    return grid(["PSNR/SSIM, splats, time", *(f"{scene}, {VIEWS[scene]} views" for scene in CAPTURES)], body)
-
+PRESETS = "splatfacto", "nrfgs-sh", "nrfgs-fast", "nrfgs", "nrfgs-best"
+"""A user's choices in results/speed.json."""
 
 # Steps and frames against splats and pixels (`timing/scale.py`).
 
@@ -74,5 +46,4 @@ def scale_fit(column: str, factor: str, unit: str, renderer: str, most: str = "i
 
 BLOCKS = {
     **{f"speed.{block.__name__}": block for block in (scale_fit, scale_ratios)},
-    "trade_off.presets": presets,
 }
