@@ -147,7 +147,7 @@ def sparse() -> str:
 def by_views() -> str:
     """Mean gain over harmonics with few of `bonsai`'s views, of the seeds that both have."""
     gains = {views: fmean(view_gains(*sparse_runs(f"{views}_views_bonsai"))) for views in FEWER}
-    return ", ".join(f"{signed(gain)} dB with {views}" for views, gain in gains.items())
+    return ", ".join(f"{signed(gain)} with {views}" for views, gain in gains.items())
 
 
 BLOCKS = {

@@ -5,10 +5,13 @@ python -m nrfgs_lab.pages.figures            # writes docs/images/*.svg
 """
 
 import math
+from collections.abc import Iterable
 from functools import partial
+from itertools import product
 from statistics import median
 
 from nrfgs_lab.pages.few_views import FEWER, FIELD, SAME, sparse_runs, today
+from nrfgs_lab.pages.files import CAPTURES, reports
 from nrfgs_lab.pages.methods import COUNTS, CURVES, HEADS_OF, RULES_OF, SEATS_OF, Labels, equal
 from nrfgs_lab.pages.runs import ROOT, VIEWS, bench_rows, mean_of, records, view_gains
 from nrfgs_lab.pages.speed import PRESETS
@@ -57,51 +60,66 @@ LINES = "#0969da", "#bc4c00", "#1a7f37", "#8250df", "#bf3989", "#808890"
 """Colours that are seen on white and on black."""
 PANEL, HIGH, SIDE = 210, 190, 40
 """Width of a panel with its numbers, height of its lines, and room beside them."""
+FITTED = {
+    "degree": "harmonics, degree 0 to 5, least squares",
+    "latent_dim": "field, latents of 4 to 16",
+    "width": "field, width 16 to 128",
+    "bands": "field, bands 1 to 6",
+}
+"""Sweep in results/express.json -> its label."""
+Points = list[tuple[float, float]]
 
 
-def curves(labels: Labels, metrics: tuple[str, ...] = ("psnr",)) -> str:
-    """Metrics over numbers of splats on three captures: a panel each, a line for each label's run and rule."""
-    places = [
-        (scene, metric, PANEL * x, (HIGH + 62) * y)
-        for y, metric in enumerate(metrics)
-        for x, scene in enumerate(CURVES)
-    ]
-    parts = [part for place in places for part in panel(labels, *place)]
-    top = (HIGH + 62) * len(metrics) + 12
+def axes(box: tuple[float, float, float], ticks: dict[float, str], values: list[float], title: str) -> tuple:
+    """A logarithmic axis with ticks, from a tenth below the least to one above the most, and one that holds values:
+    `at`, which places a point, and the parts. The box is left, top and right."""
+    step = next(step for step in (0.01, 0.02, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0) if max(values) - min(values) < 7 * step)
+    low, high = math.floor(min(values) / step + 1e-6) * step, math.ceil(max(values) / step - 1e-6) * step
+    (left, top, right), least, most = box, min(ticks) / 1.1, max(ticks) * 1.1
+
+    def at(x: float, y: float) -> tuple[float, float]:
+        across = math.log(x / least) / math.log(most / least)
+        return round(left + across * (right - left), 1), round(top + (high - y) / (high - low) * HIGH, 1)
+
+    parts = [f'<text x="{left}" y="{top - 12}">{title}</text>']
+    for tick in (low + step * index for index in range(round((high - low) / step) + 1)):
+        y = at(least, tick)[1]
+        parts.append(f'<line class="faint" x1="{left}" x2="{right}" y1="{y}" y2="{y}"/>')
+        parts.append(f'<text x="{left - 5}" y="{y + 5}" text-anchor="end">{round(tick, 6):.4g}</text>')
+    for x, label in ticks.items():
+        parts.append(f'<text x="{at(x, low)[0]}" y="{top + HIGH + 20}" text-anchor="middle">{label}</text>')
+    return at, parts
+
+
+def line(points: Points, colour: str, dashed: bool = False) -> list[str]:
+    """Dots, joined."""
+    joined, dashes = " ".join(f"{x},{y}" for x, y in points), ' stroke-dasharray="5 4"' if dashed else ""
+    dots = [f'<circle fill="{colour}" cx="{x}" cy="{y}" r="4"/>' for x, y in points]
+    return [f'<polyline fill="none" stroke="{colour}" stroke-width="2.5"{dashes} points="{joined}"/>', *dots]
+
+
+def with_legend(parts: list[str], labels: Iterable[str], top: float) -> str:
+    """The figure, with a line of the legend for each label in two columns below."""
     for index, (colour, label) in enumerate(zip(LINES, labels, strict=False)):
         x, y = 12 + 315 * (index % 2), top + 22 * (index // 2)
         parts.append(f'<line stroke="{colour}" stroke-width="4" x1="{x}" x2="{x + 26}" y1="{y - 5}" y2="{y - 5}"/>')
         parts.append(f'<text x="{x + 34}" y="{y}">{label}</text>')
-    height = top + 22 * -(-len(labels) // 2)
-    return svg(height, parts)
+    return svg(y + 12, parts)
 
 
-def panel(labels: Labels, scene: str, metric: str, left: float, top: float) -> list[str]:
-    """One capture's lines, with a logarithmic axis of splats."""
-    found = [sum((equal(scene, run, count, rule) for count in COUNTS), []) for run, rule in labels.values()]
-    lines = [[(one["splats"], one[metric]) for one in runs] for runs in found]
-    values = [value for line in lines for _, value in line]
-    step = next(step for step in (0.01, 0.02, 0.5, 1.0) if max(values) - min(values) < 6 * step)
-    low, high = math.floor(min(values) / step) * step, math.ceil(max(values) / step) * step
-    left, top, right = left + SIDE, top + 28, left + PANEL
-
-    def at(count: int, value: float) -> tuple[float, float]:
-        x = left + math.log(count / 65_000) / math.log(330_000 / 65_000) * (right - left)
-        return round(x, 1), round(top + (high - value) / (high - low) * HIGH, 1)
-
-    parts = [f'<text x="{left}" y="{top - 12}">{scene}, {"dB" if metric == "psnr" else "SSIM"}</text>']
-    for tick in (low + step * index for index in range(round((high - low) / step) + 1)):
-        y = at(65_000, tick)[1]
-        parts.append(f'<line class="faint" x1="{left}" x2="{right}" y1="{y}" y2="{y}"/>')
-        parts.append(f'<text x="{left - 5}" y="{y + 5}" text-anchor="end">{tick:.4g}</text>')
-    for count in COUNTS:
-        x = at(count, low)[0]
-        parts.append(f'<text x="{x}" y="{top + HIGH + 20}" text-anchor="middle">{count // 1000}k</text>')
-    for colour, points in zip(LINES, ([at(*one) for one in line] for line in lines), strict=False):
-        joined = " ".join(f"{x},{y}" for x, y in points)
-        parts.append(f'<polyline fill="none" stroke="{colour}" stroke-width="2.5" points="{joined}"/>')
-        parts += [f'<circle fill="{colour}" cx="{x}" cy="{y}" r="4"/>' for x, y in points]
-    return parts
+def curves(labels: Labels, metrics: tuple[str, ...] = ("psnr",)) -> str:
+    """Metrics over numbers of splats on three captures: a panel each, a line for each label's run and rule."""
+    parts = []
+    for (y, metric), (x, scene) in product(enumerate(metrics), enumerate(CURVES)):
+        found = [sum((equal(scene, run, count, rule) for count in COUNTS), []) for run, rule in labels.values()]
+        lines = [[(one["splats"], one[metric]) for one in runs] for runs in found]
+        box = PANEL * x + SIDE, (HIGH + 62) * y + 28, PANEL * (x + 1)
+        ticks, title = {count: f"{count // 1000}k" for count in COUNTS}, "dB" if metric == "psnr" else "SSIM"
+        at, drawn = axes(box, ticks, [value for points in lines for _, value in points], f"{scene}, {title}")
+        for colour, points in zip(LINES, lines, strict=False):
+            drawn += line([at(*point) for point in points], colour)
+        parts += drawn
+    return with_legend(parts, labels, (HIGH + 62) * len(metrics) + 12)
 
 
 def seconds() -> str:
@@ -110,30 +128,57 @@ def seconds() -> str:
     dots = {run: (median(row.values["time s"].values()), mean_of(row, "PSNR")) for run, row in rows.items() if row}
     one = records("trials")["one host: nrfgs/bonsai-42"]
     dots["today's nrfgs"] = one["seconds"], one["psnr"]
-
-    def at(time: float, value: float) -> tuple[float, float]:
-        x = 45 + math.log(time / 10) / math.log(40) * (WIDTH - 75)
-        return round(x, 1), round(20 + (36 - value) * HIGH / 5, 1)
-
-    parts = []
-    for value in range(31, 37):
-        (left, y), (right, _) = at(10, value), at(400, value)
-        parts.append(f'<line class="faint" x1="{left}" x2="{right}" y1="{y}" y2="{y}"/>')
-        parts.append(f'<text x="{left - 8}" y="{y + 5}" text-anchor="end">{value}</text>')
-    for time in (10, 20, 50, 100, 200, 400):
-        x, y = at(time, 31)
-        parts.append(f'<text x="{x}" y="{y + 22}" text-anchor="middle">{time} s</text>')
+    ticks = {time: f"{time} s" for time in (15, 30, 60, 120, 300)}
+    at, parts = axes((45, 28, WIDTH - 30), ticks, [value for _, value in dots.values()], "dB")
     for label, (time, value) in dots.items():
         (x, y), filled = at(time, value), 1 if label not in PRESETS else 0.3
         beside, anchor = (-10, "end") if time > 150 else (10, "start")
         parts.append(f'<circle class="better" fill-opacity="{filled}" cx="{x}" cy="{y}" r="6"/>')
         parts.append(f'<text x="{x + beside}" y="{y + 5}" text-anchor="{anchor}">{label}</text>')
-    return svg(HIGH + 50, parts)
+    return svg(HIGH + 60, parts)
+
+
+def files() -> str:
+    """What files of a model lose over their size: a line of fine-tunes for each capture, a square without one."""
+    places = {
+        scene: {name: (one["bytes"] / 1e6, -one["loss_db"]) for name, one in reports(scene).items() if "loss_db" in one}
+        for scene in CAPTURES
+    }
+    tuned = {scene: [p for name, p in of.items() if name.startswith("rate")] for scene, of in places.items()}
+    ticks = {size: f"{size} MB" for size in (0.5, 1, 2, 4, 8)}
+    losses = [loss for points in tuned.values() for _, loss in points]
+    at, parts = axes((55, 28, WIDTH - 50), ticks, losses, "dB against the model")
+    for colour, (scene, points) in zip(LINES, tuned.items(), strict=False):
+        parts += line([at(*point) for point in points], colour)
+        x, y = at(*places[scene]["version-2"])
+        parts.append(f'<rect fill="{colour}" x="{x - 5}" y="{y - 5}" width="10" height="10"/>')
+    return with_legend(parts, tuned, HIGH + 75)
+
+
+def fitted() -> str:
+    """PSNR of fitted colours over parameters, from 15 to 40 dB: training directions, and dashed ones held out."""
+    parts, runs = [], records("express")["summary"]["sweep"]
+    for side, (setup, title) in enumerate({"synthetic": "synthetic, dB", "pixels": "measured, dB"}.items()):
+        sweeps = [[one for one in runs if (one["setup"], one["model"]) == (setup, model)] for model in FITTED]
+        lines = [
+            [sorted((r["parameters"], r[kind]["mean"]) for r in sweep if 15 < r[kind]["mean"] < 40) for sweep in sweeps]
+            for kind in ("train_psnr", "held_out_psnr")
+        ]
+        values = [value for of in lines for points in of for _, value in points]
+        ticks = {1000: "1k", 4000: "4k", 16_000: "16k", 40_000: "40k"}
+        at, drawn = axes((320 * side + SIDE, 28, 320 * side + 310), ticks, values, title)
+        for dashed, of in enumerate(lines):
+            for colour, points in zip(LINES, of, strict=False):
+                drawn += line([at(*point) for point in points], colour, bool(dashed))
+        parts += drawn
+    return with_legend(parts, FITTED.values(), HIGH + 75)
 
 
 FIGURES = {
     "views.svg": views,
     "seconds.svg": seconds,
+    "files.svg": files,
+    "fitted.svg": fitted,
     "heads.svg": partial(curves, HEADS_OF),
     "rules.svg": partial(curves, RULES_OF, ("psnr", "ssim")),
     "seats.svg": partial(curves, SEATS_OF),
