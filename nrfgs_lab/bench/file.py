@@ -22,7 +22,7 @@ from typing import Any
 
 import yaml
 
-from nrfgs_lab.bench.spec import DEFAULT, OWN, Method, Scene, Spec, cells_of, strategies_of, strategy_options
+from nrfgs_lab.bench.spec import DEFAULT, OWN, Method, Scene, Spec, cells_of, is_ours, strategies_of, strategy_options
 from nrfgs_ns.errors import InputError
 
 SET_HERE = {
@@ -115,7 +115,7 @@ def _check_run(run: Method, spec: Spec, where: str) -> None:
         given = dict.fromkeys(options, f"strategy {strategy} gives it; use strategy own")
         _require_free((*spec.options, *run.options), given, where)
         _require(
-            run.method.startswith("nrfgs") or not options,
+            not options or is_ours(run.method),
             f"{where}: {run.method} knows no strategy {strategy!r}; only this project's methods do. Use own, and the "
             "method's options.",
         )

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nrfgs_lab.bench.spec import QUIET, Cell, Spec, steps_of, strategy_options
+from nrfgs_lab.bench.spec import QUIET, Cell, Spec, is_ours, steps_of, strategy_options
 from nrfgs_ns.errors import InputError
 
 
@@ -29,7 +29,7 @@ def command(spec: Spec, cell: Cell, parser: list[str], work: Path) -> list[str]:
     """Command line of ns-train for one training, with a data parser's options (`data.py`), saved below `work`."""
     steps = steps_of(spec, cell.run, cell.scene)
     # Only this project's methods resume from a checkpoint.
-    every = spec.checkpoint_every if cell.run.method.startswith("nrfgs") and steps else 10**9
+    every = spec.checkpoint_every if is_ours(cell.run.method) and steps else 10**9
     return [
         cell.run.method,
         *("--output-dir", str(work), "--experiment-name", Path(cell.scene.path).name),

@@ -23,6 +23,7 @@ from filelock import FileLock
 
 from nrfgs_lab.bench.job import Job
 from nrfgs_lab.bench.measure import measure
+from nrfgs_lab.bench.spec import is_ours
 from nrfgs_lab.training_run import TrainRecord, evaluate, machine, train
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints
@@ -72,7 +73,7 @@ def host_without_downloads(method: str) -> AbstractContextManager:
 
     allow_nerfstudio_checkpoints()
     weights = Path(torch.hub.get_dir()) / "checkpoints" / Path(AlexNet_Weights.DEFAULT.url).name
-    if method.startswith("nrfgs") or weights.is_file():
+    if is_ours(method) or weights.is_file():
         return contextlib.nullcontext()
     lpips = "torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity"
     return mock.patch(lpips, lambda **_: lambda *_: torch.tensor(float("nan")))
@@ -89,7 +90,7 @@ def train_or_continue(job: Job, work: Path) -> TrainRecord:
         write_whole(work / "train.json", json.dumps(asdict(record)))
 
     args = job.args
-    checkpoint = last_checkpoint(work) if args[0].startswith("nrfgs") and job.steps else None
+    checkpoint = last_checkpoint(work) if is_ours(args[0]) and job.steps else None
     earlier = checkpoint and record_until(work / "train.json", checkpoint)
     if earlier is not None:
         if earlier.steps >= job.steps:
