@@ -64,13 +64,11 @@ class McmcDensification(Densification):
     would shake them.
     """
 
-    name = Mcmc.name
-
     def __init__(self, config: Mcmc, scene_unit: float):
-        super().__init__(config.opacity_seen)
+        super().__init__(config)
         if config.opacity_seen == "peak":
             self.state[CHANGE_BEFORE] = None
-        self.config, self.budget, self.scene_unit = config, config.budget, scene_unit
+        self.scene_unit = scene_unit
         self.start, self.stop = config.warmup_length, config.stop_at
 
     def rests_at(self, step: int) -> bool:
@@ -95,7 +93,7 @@ class McmcDensification(Densification):
         dead = self.seen_opacity(splats["opacities"], before=False) <= MIN_OPACITY
         moved = relocate(splats, optimizers, dead, MIN_OPACITY)
         count = len(splats["means"])
-        wanted = max(min(self.config.budget, int(1.05 * count)) - count, 0)
+        wanted = max(min(self.budget, int(1.05 * count)) - count, 0)
         wanted = self.fitting(step, info, splats, optimizers, wanted)
         added = add_samples(splats, optimizers, wanted, MIN_OPACITY)
         if self.state.get(CHANGE) is not None:
