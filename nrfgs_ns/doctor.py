@@ -80,22 +80,20 @@ def machine() -> list[Finding]:
 def kernels(device) -> list[Finding]:
     """Whether gsplat's kernels load, which compiles them if that is to be done, for minutes; whether Triton's run."""
     from nrfgs_ns.appearance.nrf import NrfConfig
-    from nrfgs_ns.densification import statistics
-    from nrfgs_ns.image import ssim
     from nrfgs_ns.kernels import trial
-    from nrfgs_ns.rasterizer import load_kernels
-    from nrfgs_ns.training import optimizers
+    from nrfgs_ns.training.pipeline import kernels_of
 
+    load_gsplat, *trials = kernels_of(NrfConfig().setup())
     reasons: list[str] = []
     trial.logger.addHandler(handler := logging.Handler())
     handler.emit = lambda record: reasons.append(record.getMessage())
     gsplat = Finding("gsplat's kernels", "load")
     try:
-        load_kernels(device)
+        load_gsplat(device)
     except Exception as error:
         fix = "They are compiled at first use: install a C++ compiler and the CUDA toolkit (nvcc) of PyTorch's version."
         gsplat = Finding("gsplat's kernels", f"do not load ({type(error).__name__}: {error})", fix, True)
-    for attempt in (NrfConfig().setup().try_kernels, ssim.kernels_run_on, statistics.try_kernel, optimizers.try_kernel):
+    for attempt in trials:
         attempt(device)
     trial.logger.removeHandler(handler)
     fix = f"Training is slower; install Triton and a C compiler: {' '.join(reasons)}" if reasons else ""

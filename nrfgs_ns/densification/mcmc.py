@@ -59,7 +59,7 @@ class McmcDensification(Densification):
     """Relocation, growth to a budget, and noise (`relocation.py`).
 
     Which opacity is seen decides that a splat is dead, and how far noise may move it. What a relocated splat gets is
-    computed from the stored opacities. The mean opacity in the loss is that of what the step's cameras are shown
+    computed from the stored opacities. The mean opacity in the loss is the one that the step's cameras are shown
     (`mean_opacity`). With the stored ones alone, splats that every view shows would count as dead, too, and the noise
     would shake them.
     """

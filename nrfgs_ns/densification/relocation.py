@@ -27,7 +27,7 @@ MAX_COPIES = 51
 NOISE_SHARPNESS = 100.0
 """The noise's sigmoid falls from 1 to 0 around opacity 0.005 with this slope: live splats hold still."""
 NOISE_OPACITY = 0.005
-"""Opacity at which the noise is half as large as that of an invisible splat."""
+"""Opacity at which the noise is half as large as of an invisible splat."""
 
 
 def split_evenly(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,7 +13,7 @@ import torch
 import torch.distributed as dist
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.scripts.train import _set_random_seed
-from nerfstudio.utils import comms, profiler
+from nerfstudio.utils import comms
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.optim import Optimizer
@@ -52,7 +52,6 @@ class ShardedPipeline(NrfgsPipeline):
         self.world_size = world_size
         torch.manual_seed(torch.initial_seed() + 1 + comm.rank())
 
-    @profiler.time_function
     def get_train_loss_dict(self, step: int, graphs: None = None):
         """One camera for each device; see `NrfgsPipeline.get_train_loss_dict`."""
         cameras, batch = self.datamanager.next_train_views(comm.world(), comm.rank())

@@ -20,7 +20,7 @@ from nrfgs_ns.compact.finetune import REPORT_EVERY, fine_tune
 from nrfgs_ns.compact.format import container
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.options import CompactOptions
-from nrfgs_ns.files import whole, write_whole
+from nrfgs_ns.files import write_whole
 from nrfgs_ns.progress import progress
 from nrfgs_ns.threads import few_threads
 from nrfgs_ns.trained.loading import find_data, finish, load_model, lost, measure_loss
@@ -79,7 +79,7 @@ def write_file(
     """Write a compact file; returns the config.yml with which nerfstudio reads it, and numbers for a report.
 
     Args:
-        total: bytes of all that is written with a compact file of so many bytes, for `options.size_mb`.
+        total: bytes of the compact file -> bytes of all that is written, for `options.size_mb`.
     """
     model, times, rate = pipeline.model, [perf_counter()], None
     field, steps = model.field.detached(), None
@@ -100,8 +100,7 @@ def write_file(
         field = with_rank(field, basis, field.head.config.latent_dim)
     times.append(perf_counter())
     data, coarser = encoded(field, render, steps, limit, total)
-    with whole(output) as aside:
-        aside.write_bytes(data)
+    write_whole(output, data)
     times.append(perf_counter())
     decoded = decode(output)
     times.append(perf_counter())

@@ -351,7 +351,7 @@ class NrfgsModel(SplatfactoModel):
     def set_background(self, background_color: Tensor) -> None:
         """Set the background [3] of the viewer's pictures alone: evaluation keeps its own."""
         if self.viewer_panel is not None:
-            self.viewer_panel.set_background(background_color)
+            self.viewer_panel.background = background_color
 
     def fit_on(self, cameras: Cameras, steps: int | None = None) -> None:
         """Fit harmonics over these cameras [V] once one of the properties below is read.

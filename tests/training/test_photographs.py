@@ -13,7 +13,7 @@ from short_trainings import assert_same_training, checkpoint_of, command_line, m
 from nrfgs_lab.training_run import parse
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.overlap import Pairs, estimate
-from nrfgs_ns.image.photograph import exposed
+from nrfgs_ns.image.photograph import BASIS, exposed
 from nrfgs_ns.trained.loading import load_model
 from nrfgs_ns.training.photographs import Evidence, exif_of, exposure
 
@@ -163,7 +163,7 @@ def test_what_is_behind_a_cut_out_photograph_is_exposed_with_it(tiny_scene, tmp_
     grey = torch.full((3,), 0.5)
     model.config.num_downscales = 0
     truth = model.truth_of(transparent, grey)
-    torch.testing.assert_close(truth, exposed(grey.expand(6, 8, 3), model.photograph.stops()[3]))
+    torch.testing.assert_close(truth, exposed(grey.expand(6, 8, 3), model.photograph.shots[3] @ torch.tensor(BASIS)))
     assert torch.equal(model.eval().truth_of(transparent, grey), grey.expand(6, 8, 3))
 
 
