@@ -99,12 +99,10 @@ class ErrorGuidedDensification(Densification):
     """Splits by error, replacement by opacity, decay of opacity."""
 
     def __init__(self, config: ErrorGuided, raised: float):
-        super().__init__(config)
+        super().__init__(config, windows=2)
         self.state |= {ERROR: None, WIDTH: None}
         if config.budget:
             self.state[FIRST] = None
-        if config.opacity_seen == "peak":
-            self.state[CHANGE_BEFORE] = None
         self.raised = raised
         self.reschedule(round)
 

@@ -11,7 +11,6 @@ from torch import Tensor
 from nrfgs_ns.densification.relocation import add_noise, add_samples, relocate
 from nrfgs_ns.densification.strategy import (
     CHANGE,
-    CHANGE_BEFORE,
     Densification,
     DensificationConfig,
     OpacitySeen,
@@ -65,9 +64,7 @@ class McmcDensification(Densification):
     """
 
     def __init__(self, config: Mcmc, scene_unit: float):
-        super().__init__(config)
-        if config.opacity_seen == "peak":
-            self.state[CHANGE_BEFORE] = None
+        super().__init__(config, windows=2)
         self.scene_unit = scene_unit
         self.start, self.stop = config.warmup_length, config.stop_at
 

@@ -145,7 +145,12 @@ class Shown(NamedTuple):
 
 
 class Densification(ABC):
-    """What the model asks of a strategy. `state` is all that a continued training needs, and goes into checkpoints."""
+    """What the model asks of a strategy. `state` is all that a continued training needs, and goes into checkpoints.
+
+    Args:
+        config: its options.
+        windows: between refinements, 1 or 2, whose views `seen_opacity` looks at.
+    """
 
     state: dict[str, Any]
     """Numbers, tuples of them, tensors with a row per splat, or None for what the first step has to make."""
@@ -154,11 +159,12 @@ class Densification(ABC):
     pixels: int = 0
     """Of the largest photograph."""
 
-    def __init__(self, config: DensificationConfig):
+    def __init__(self, config: DensificationConfig, windows: int = 1):
         self.config, self.name, self.opacity_seen = config, config.name, config.opacity_seen
         self.budget: int = config.budget
         """Number of splats to grow to; 0: as many as the rules give."""
-        self.state = {HELD: None, **({CHANGE: None} if self.opacity_seen == "peak" else {})}
+        seen = (CHANGE, CHANGE_BEFORE)[:windows] if self.opacity_seen == "peak" else ()
+        self.state = {HELD: None, **dict.fromkeys(seen)}
         self.shown: Shown | None = None
 
     def needs_absgrad(self, step: int) -> bool:

@@ -17,12 +17,11 @@ from nerfstudio.viewer.utils import CameraState
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException, SetTrace
 from PIL import Image
-from short_trainings import assert_same_training, checkpoint_of, command_line, set_up
+from short_trainings import assert_same_training, checkpoint_of, command_line, set_up, untrained
 from torch.testing import assert_close
 from viser.infra import _infra
 
 from nrfgs_lab.scenes import SceneConfig, write_scene
-from nrfgs_lab.training_run import parse
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.appearance.nrf import NrfConfig
@@ -46,11 +45,8 @@ def build(tiny_scene, tmp_path_factory):
     """Pipeline of a method whose head has learnt something, and with opacities at which a pixel shows few splats."""
 
     def pipeline(method="nrfgs", *options):
-        out = tmp_path_factory.mktemp("out")
-        config = parse([method, "--data", str(tiny_scene), "--output-dir", str(out), *map(str, options)])
-        config.pipeline.model.few_views = "off"
-        torch.manual_seed(0)
-        pipeline = config.pipeline.setup(device="cpu", test_mode="val")
+        few = "--pipeline.model.few-views", "off"
+        pipeline = untrained(tiny_scene, tmp_path_factory.mktemp("out"), method, *few, *options)
         model = pipeline.model
         for parameter in model.head.parameters():
             torch.nn.init.normal_(parameter, std=0.5)
