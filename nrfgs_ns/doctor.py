@@ -60,7 +60,7 @@ def imports() -> list[Finding]:
 
 
 def machine() -> list[Finding]:
-    """The weights of LPIPS; the GPU and what runs there, or what it means that there is none."""
+    """The weights of LPIPS; the GPU and what runs there, or what its absence means."""
     import torch
 
     from nrfgs_ns.image.metrics import lpips_advice

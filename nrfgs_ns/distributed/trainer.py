@@ -155,7 +155,7 @@ class ShardedGuard(Guard):
             raise self._together(stopped) from None
 
     def _together(self, stopped: TrainingStopped | None) -> TrainingStopped:
-        """One exception for all devices: that of the first whose own image or loss is bad, which spreads to all
+        """One exception for all devices: from the first whose own image or loss is bad, which spreads to all
         gradients; otherwise of the first that found something itself."""
         mine = None if stopped is None else (str(stopped), stopped.step, stopped.origin, stopped.savable)
         stops = [(device, *stop) for device, stop in enumerate(comm.gather_objects(mine)) if stop is not None]

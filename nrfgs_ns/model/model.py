@@ -112,7 +112,7 @@ class NrfgsModel(ExportedModel):
         return initial_splats(self.config, self.head, self.seed_points, self.scene_unit)
 
     def start_from(self, seed_points: tuple[Tensor, Tensor]) -> None:
-        """Before a training: start from other points, positions [P, 3] and colours [P, 3] in 0..255."""
+        """Start a new training from other points, positions [P, 3] and colours [P, 3] in 0..255."""
         self.seed_points = seed_points
         with torch.random.fork_rng(devices=[]):  # the same on each of several devices
             torch.default_generator.manual_seed(self._seed)
