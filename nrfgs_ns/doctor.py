@@ -40,12 +40,12 @@ def packages() -> list[Finding]:
         if uses := [use for extra, use in EXTRAS.items() if marker is None or marker.evaluate({"extra": extra})]:
             use = "`nrfgs prepare`" if name == "pycolmap" else uses[0]
             try:
-                found = version(name)
-                fits = requirement.specifier.contains(found, prereleases=True)
+                installed = version(name)
+                fits = requirement.specifier.contains(installed, prereleases=True)
             except PackageNotFoundError:
-                found, fits = "missing", False
+                installed, fits = "missing", False
             fix = "" if fits else f"For {use} run `pip install '{name}{requirement.specifier}'`."
-            findings.append(Finding(name, found, fix, not fits and use == TRAINING))
+            findings.append(Finding(name, installed, fix, not fits and use == TRAINING))
     return findings
 
 
