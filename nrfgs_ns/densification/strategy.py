@@ -74,6 +74,15 @@ def seen_with(stored: Tensor, change: Tensor) -> Tensor:
     return torch.where(change < 0, stored * (1 + change), stored + change).clamp_max(1.0)
 
 
+def per_splat(state: Mapping[str, Any], count: int) -> dict[str, Tensor]:
+    """The entries of a state that have a row for each of `count` splats."""
+    return {
+        name: value
+        for name, value in state.items()
+        if isinstance(value, Tensor) and value.dim() > 0 and len(value) == count
+    }
+
+
 @dataclass
 class DensificationConfig(ABC):
     """Options of a strategy. Steps count from 0; `reschedule` stretches them to the training."""
