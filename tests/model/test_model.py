@@ -36,10 +36,8 @@ pytestmark = pytest.mark.usefixtures("no_cuda")
 
 @pytest.fixture
 def build(tiny_scene, tmp_path):
-    def pipeline(method="nrfgs", *options):
-        return untrained(tiny_scene, tmp_path, method, "--pipeline.model.few-views", "off", *options)
-
-    return pipeline
+    off = "--pipeline.model.few-views", "off"
+    return lambda method="nrfgs", *options: untrained(tiny_scene, tmp_path, method, *off, *options)
 
 
 def test_the_head_sees_only_what_the_camera_sees(build, monkeypatch):
