@@ -25,7 +25,7 @@ def commands() -> dict[str, EntryPoint]:
 
 
 def summary(command: EntryPoint) -> str:
-    """The first sentence of a command's docstring, read from its source; "" if there is none."""
+    """The first sentence of a command's docstring, read from its source; "" without one."""
     spec = find_spec(command.module)
     if spec is None or spec.origin is None:
         return ""

@@ -40,12 +40,12 @@ def packages() -> list[Finding]:
         if uses := [use for extra, use in EXTRAS.items() if marker is None or marker.evaluate({"extra": extra})]:
             use = "`nrfgs prepare`" if name == "pycolmap" else uses[0]
             try:
-                found = version(name)
-                fits = requirement.specifier.contains(found, prereleases=True)
+                installed = version(name)
+                fits = requirement.specifier.contains(installed, prereleases=True)
             except PackageNotFoundError:
-                found, fits = "missing", False
+                installed, fits = "missing", False
             fix = "" if fits else f"For {use} run `pip install '{name}{requirement.specifier}'`."
-            findings.append(Finding(name, found, fix, not fits and use == TRAINING))
+            findings.append(Finding(name, installed, fix, not fits and use == TRAINING))
     return findings
 
 
@@ -60,7 +60,7 @@ def imports() -> list[Finding]:
 
 
 def machine() -> list[Finding]:
-    """The weights of LPIPS; the GPU and what runs there, or what it means that there is none."""
+    """The weights of LPIPS; the GPU and what runs there, or what its absence means."""
     import torch
 
     from nrfgs_ns.image.metrics import lpips_advice
@@ -80,22 +80,20 @@ def machine() -> list[Finding]:
 def kernels(device) -> list[Finding]:
     """Whether gsplat's kernels load, which compiles them if that is to be done, for minutes; whether Triton's run."""
     from nrfgs_ns.appearance.nrf import NrfConfig
-    from nrfgs_ns.densification import statistics
-    from nrfgs_ns.image import ssim
     from nrfgs_ns.kernels import trial
-    from nrfgs_ns.rasterizer import load_kernels
-    from nrfgs_ns.training import optimizers
+    from nrfgs_ns.training.pipeline import kernels_of
 
+    load_gsplat, *trials = kernels_of(NrfConfig().setup())
     reasons: list[str] = []
     trial.logger.addHandler(handler := logging.Handler())
     handler.emit = lambda record: reasons.append(record.getMessage())
     gsplat = Finding("gsplat's kernels", "load")
     try:
-        load_kernels(device)
+        load_gsplat(device)
     except Exception as error:
         fix = "They are compiled at first use: install a C++ compiler and the CUDA toolkit (nvcc) of PyTorch's version."
         gsplat = Finding("gsplat's kernels", f"do not load ({type(error).__name__}: {error})", fix, True)
-    for attempt in (NrfConfig().setup().try_kernels, ssim.kernels_run_on, statistics.try_kernel, optimizers.try_kernel):
+    for attempt in trials:
         attempt(device)
     trial.logger.removeHandler(handler)
     fix = f"Training is slower; install Triton and a C compiler: {' '.join(reasons)}" if reasons else ""

@@ -24,10 +24,10 @@ def check_writable(path: Path, option: str) -> None:
         raise InputError(f"{option} {path} cannot be written ({error}). Name a file in a folder of yours.") from error
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Write a file aside and move it into place: readers find all of it or none."""
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Write a file aside and move it into place: readers find all of it or none. Text is UTF-8."""
     with whole(path) as aside:
-        aside.write_text(text, encoding="utf-8")
+        aside.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 @contextlib.contextmanager

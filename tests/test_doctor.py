@@ -8,12 +8,11 @@ from unittest.mock import Mock
 import pytest
 import torch
 
-import nrfgs_ns.rasterizer
 from nrfgs_ns import doctor
 from nrfgs_ns.densification import statistics
 from nrfgs_ns.image import metrics, ssim
 from nrfgs_ns.kernels.trial import Gate
-from nrfgs_ns.training import optimizers
+from nrfgs_ns.training import optimizers, pipeline
 
 DECLARED = {
     "torch>=2.6": "2.15.0+cpu",
@@ -92,7 +91,7 @@ def test_without_a_gpu_it_says_what_that_means(monkeypatch, cuda, fix, advice):
 
 def test_kernels_that_fail_are_told_apart(monkeypatch):
     """gsplat's are needed; for Triton's there is PyTorch, and the reason is that of the trial."""
-    monkeypatch.setattr(nrfgs_ns.rasterizer, "load_kernels", lambda _: None)
+    monkeypatch.setattr(pipeline, "load_kernels", lambda _: None)
     for owner, name in ((ssim, "kernels_run_on"), (statistics, "try_kernel"), (optimizers, "try_kernel")):
         monkeypatch.setattr(owner, name, lambda _: True)
     monkeypatch.setattr("nrfgs_ns.appearance.nrf.NeuralResidualField.try_kernels", lambda *_: None)
@@ -101,7 +100,7 @@ def test_kernels_that_fail_are_told_apart(monkeypatch):
     monkeypatch.setattr(ssim, "kernels_run_on", lambda device: Gate("SSIM").opens(device, device, trial))
     gsplat, triton = doctor.kernels(CPU)
     assert not gsplat.fix and not triton.broken and "SSIM" in triton.fix and "no compiler" in triton.fix
-    monkeypatch.setattr(nrfgs_ns.rasterizer, "load_kernels", Mock(side_effect=ImportError("no nvcc")))
+    monkeypatch.setattr(pipeline, "load_kernels", Mock(side_effect=ImportError("no nvcc")))
     gsplat, _ = doctor.kernels(CPU)
     assert gsplat.broken and "no nvcc" in gsplat.state and "nvcc" in gsplat.fix
 

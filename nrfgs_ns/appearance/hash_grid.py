@@ -8,8 +8,8 @@ x it interpolates trilinearly between the eight lattice points around N_l x; lat
 
 (T. Mueller, A. Evans, C. Schied, A. Keller, "Instant Neural Graphics Primitives with a Multiresolution Hash Encoding",
 SIGGRAPH 2022). Positions are coordinates in scene units, not normalised to a cube: the hash is defined on the whole
-lattice, in two's complement, and nothing is clamped. T is a power of two, so that modulo T the hash is that of unsigned
-32-bit arithmetic.
+lattice, in two's complement, and nothing is clamped. T is a power of two, so that modulo T the hash is the one of
+unsigned 32-bit arithmetic.
 
 Where a level's lattice over [-1, 1]^3, to which nerfstudio scales its scenes, has no more points than the table has
 rows, (2 N_l)^3 <= T, points are not hashed but numbered:

@@ -85,7 +85,7 @@ class NrfConfig(AppearanceHeadConfig):
         return replace(self, opacity_scale=share * self.opacity_scale) if self.opacity_residual else self
 
     def for_copies(self) -> "NrfConfig":
-        """By default twice the residual, on the logit: each part of a splat would add a whole one to its opacity."""
+        """Twice the residual by default, on the logit: each part of a splat would add a whole one to its opacity."""
         on_logit = {"opacity_bound": "logit", "opacity_scale": 2 * self.opacity_scale}
         return self if self.opacity_bound or not self.opacity_residual else replace(self, **on_logit)
 

@@ -31,11 +31,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.compact.format import Table
 from nrfgs_ns.compact.tables import COLUMNS, MOST_BITS, Grid, morton, steps_of, tables_of
+from nrfgs_ns.data.checks import warn
 from nrfgs_ns.errors import InputError
 
 FORMAT = "nrfgs-compact"
@@ -66,10 +66,9 @@ def encode(
     steps = {name: coarser * step for name, step in (steps_of(tables) if steps is None else steps).items()}
     needed = np.ptp(tables["means"].cpu().numpy(), axis=0) / (2**MOST_BITS - 1)
     if (needed > steps["means"]).any():
-        CONSOLE.print(
-            f"[bold yellow]Some splats are so far from the others that {MOST_BITS} bits are too few for a coordinate: "
-            f"means are rounded to {float(needed.max()):.3g} units instead of {float(steps['means'].min()):.3g}.",
-            soft_wrap=True,
+        warn(
+            f"Some splats are so far from the others that {MOST_BITS} bits are too few for a coordinate: means are "
+            f"rounded to {float(needed.max()):.3g} units instead of {float(steps['means'].min()):.3g}."
         )
     steps["means"] = np.maximum(steps["means"], needed).clip(min=np.finfo(np.float32).tiny)
     grids, codes = {}, {}

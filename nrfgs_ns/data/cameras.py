@@ -97,7 +97,7 @@ def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -
 
 
 def check_applied(meta: dict[str, Any], source: Path) -> None:
-    """If present, applied_transform is a 3 x 4 matrix and applied_scale a positive number."""
+    """Check that applied_transform, if present, is a 3 x 4 matrix, and applied_scale a positive number."""
     if "applied_transform" in meta:
         applied = matrix(meta["applied_transform"])
         if applied.shape != (3, 4) or not np.isfinite(applied).all():
@@ -185,9 +185,9 @@ def _lens(values: dict[str, Any], source: Path) -> list[float]:
         and all(WIDEST * size <= focal <= NARROWEST * size for focal in (fl_x, fl_y))
         and all(abs(center - side / 2) <= FARTHEST_CENTER * side for center, side in ((cx, w), (cy, h)))
     ):
-        found = ", ".join(f"{key} {shown(repr(values[key])) if key in values else 'missing'}" for key in PIXELS)
+        lens = ", ".join(f"{key} {shown(repr(values[key])) if key in values else 'missing'}" for key in PIXELS)
         raise InputError(
-            f"{source}: the lens {of} has {found}: no lens does that. Give all in pixels of one image, {SMALLEST} to "
+            f"{source}: the lens {of} has {lens}: no lens does that. Give all in pixels of one image, {SMALLEST} to "
             f"{LARGEST} a side (from a field of view: fl_x = w / (2 tan(camera_angle_x / 2)))."
         )
     stored = values.get("distortion_params", [values.get(key, 0.0) for key in DISTORTION])
@@ -201,7 +201,7 @@ def _lens(values: dict[str, Any], source: Path) -> list[float]:
 
 
 def _check_model(meta: dict[str, Any], source: Path) -> None:
-    """The camera model of the top level, which holds for all frames, can be drawn, and no other is named."""
+    """Check that the top level's camera model, which holds for all frames, can be drawn, and no other is named."""
     model = meta.get("camera_model", "OPENCV")
     drawn = [name for name, kind in CAMERA_MODEL_TO_TYPE.items() if kind in DRAWN]
     for holder in (meta, *meta["frames"]):
@@ -240,7 +240,7 @@ def cameras_of(meta: dict[str, Any], lenses: np.ndarray, poses: Tensor, source: 
 
 
 def _check_distortion(lens: np.ndarray, kind: CameraType, where: str) -> None:
-    """Undistorting leaves enough of the image."""
+    """Check that undistorting leaves enough of the image."""
     fx, fy, cx, cy, w, h, k1, k2, k3, k4, p1, p2 = lens
     K, size = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]]), (int(w), int(h))
     if kind == CameraType.FISHEYE:

@@ -63,7 +63,7 @@ def find_colmap(folder: Path) -> str | None:
 
 
 def check_options(config: Any) -> None:
-    """The parser's numbers are in their ranges."""
+    """Check that the parser's numbers are in their ranges."""
     for name, least in (("scale_factor", 0), ("scene_scale", 0), ("downscale_factor", 1), ("eval_interval", 1)):
         value = getattr(config, name)
         if value is not None and not (0 < value < math.inf and value >= least):
@@ -72,7 +72,7 @@ def check_options(config: Any) -> None:
 
 
 def check_frames(frames: list[dict[str, Any]], source: Path) -> None:
-    """Every frame names an image of its own; masks are named by all frames or by none."""
+    """Check that every frame names an image of its own, and that all frames or no frames name masks."""
 
     def without(key: str) -> list[int]:
         names = [frame.get(key) for frame in frames]
@@ -90,14 +90,14 @@ def check_frames(frames: list[dict[str, Any]], source: Path) -> None:
 
 
 def check_unique(names: Iterable[Any], where: str) -> None:
-    """No name occurs twice; `where` begins the message."""
+    """Check that no name occurs twice; `where` begins the message."""
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         raise InputError(f"{where} name {some(twice)} more than once. Keep one of each.")
 
 
 def check_exist(paths: Sequence[Path], source: Path, what: str) -> None:
-    """Every file exists; `what` is their kind."""
+    """Check that every file exists; `what` is their kind."""
     missing = [path for path in paths if not os.path.isfile(path)]  # unlike Path's, False for a name too long
     if missing:
         raise InputError(
@@ -107,7 +107,7 @@ def check_exist(paths: Sequence[Path], source: Path, what: str) -> None:
 
 
 def check_headers(paths: Sequence[Path], sizes: Sequence[tuple[int, int]], what: str, fix: str) -> None:
-    """Every file is an image of the given size (width, height), by its header; `what` is their kind."""
+    """Check that every file is an image of the given size (width, height), by its header; `what` is their kind."""
     headers = [(path, read_size(path), tuple(size)) for path, size in zip(paths, sizes, strict=True)]
     wrong = [f"{path} is {w} x {h}, not {size[0]} x {size[1]}" for path, (w, h), size in headers if (w, h) != size]
     if wrong:

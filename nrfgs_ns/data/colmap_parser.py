@@ -80,6 +80,6 @@ class NrfgsColmapDataParser(NrfgsDataParser):
 
 
 def checked(config: DataParserConfig) -> DataParserConfig:
-    """A parser's configuration; of nerfstudio's own two, that of our parser in its place."""
+    """A parser's configuration; nerfstudio's own two become our parsers'."""
     parsers = {NerfstudioDataParserConfig: NrfgsDataParser, ColmapDataParserConfig: NrfgsColmapDataParser}
     return replace(config, _target=parsers[type(config)]) if type(config) in parsers else config

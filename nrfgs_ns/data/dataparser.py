@@ -225,7 +225,7 @@ class NrfgsDataParser(DataParser):
         return root.with_name(f"{root.name}_{factor}")
 
     def _check_sizes(self, scene: Scene, rows: np.ndarray, key: str, paths: list[Path], cameras: Cameras) -> None:
-        """Images or masks have the size of their cameras, or the full one where the data set has no smaller copies."""
+        """Check that images or masks have the size of their cameras, or the full one without smaller copies."""
         what = FOLDERS[key]
         if self._has_copies(key, scene.factor):
             check_unique(paths, f"{scene.source}: frames")

@@ -41,8 +41,8 @@ def in_reach(xyz: np.ndarray, cameras: Cameras, source: Path) -> np.ndarray:
 
 
 def check_sight(xyz: torch.Tensor, cameras: Cameras, names: Sequence[str], source: Path) -> None:
-    """Enough points [N, 3] at different places are in some of the named training views, and most views have some; a
-    warning names the views without any."""
+    """Check that the named training views see enough of the points [N, 3], at different places, and most views some of
+    them; a warning names the views without any."""
     points = xyz[:: max(len(xyz) // MOST_POINTS, 1)].float()
     visible = [_in_view(points, cameras[index]) for index in range(len(names))]
     blind = [name for name, seen in zip(names, visible, strict=True) if not seen.any()]

@@ -6,7 +6,7 @@ table, whichever head it belongs to, and to the optimisers' moments. The model n
 
 On the command line a strategy is one word, its name and options of its own: `mcmc,budget=150000,refine_every=50`.
 `strategy.py` is the interface; `gradient.py`, `error_guided.py` and `mcmc.py` (with `relocation.py`) have the
-strategies, `statistics.py` and `rows.py` what they share.
+strategies, `statistics.py` what they share.
 """
 
 from dataclasses import fields

@@ -33,6 +33,7 @@ from nrfgs_ns.densification.statistics import take_maxima
 from nrfgs_ns.densification.strategy import (
     CHANGE,
     CHANGE_BEFORE,
+    FIRST,
     UNSEEN,
     Densification,
     DensificationConfig,
@@ -43,8 +44,6 @@ from nrfgs_ns.densification.strategy import (
 
 ERROR = "error"
 """Name in `state`: the largest error of each splat in a view of this window, [N]."""
-FIRST = "first_count"
-"""Name in `state`: splats at the first refinement, where a budget's course starts."""
 WIDTH = "width"
 """Name in `state`: the largest radius of each splat in this window, in longer sides of the image, [N]; 0: not seen."""
 DEAD = 0.1
@@ -99,16 +98,12 @@ class ErrorGuided(DensificationConfig):
 class ErrorGuidedDensification(Densification):
     """Splits by error, replacement by opacity, decay of opacity."""
 
-    name = ErrorGuided.name
-
     def __init__(self, config: ErrorGuided, raised: float):
-        super().__init__(config.opacity_seen)
+        super().__init__(config, windows=2)
         self.state |= {ERROR: None, WIDTH: None}
         if config.budget:
             self.state[FIRST] = None
-        if config.opacity_seen == "peak":
-            self.state[CHANGE_BEFORE] = None
-        self.config, self.raised, self.budget = config, raised, config.budget
+        self.raised = raised
         self.reschedule(round)
 
     def reschedule(self, step_at: Callable[[float], int]) -> None:
@@ -184,15 +179,12 @@ class ErrorGuidedDensification(Densification):
         """Weights [N] by which splats are drawn to be split, and how many are wanted.
 
         Without a budget: `SHARE` of the splats above the threshold, less those that replace dead ones, and all wide
-        ones. With one, as many as the number lacks of its course N0 + (2x - x^2) (budget - N0), x being the share of
-        growth that is over.
+        ones. With one, as many as the number lacks of its `course`.
         """
-        error, budget = self.state[ERROR].masked_fill(dead, 0.0), self.config.budget
-        wide = wide & ~dead
-        if budget:
-            self.state[FIRST] = first = self.state[FIRST] or count
-            x = min((step - self.start) / max(self.grow_until - self.start - self.config.refine_every, 1), 1.0)
-            return error.masked_fill(wide, math.inf), round(first + (2 * x - x * x) * (budget - first)) - count
+        error, wide = self.state[ERROR].masked_fill(dead, 0.0), wide & ~dead
+        if self.budget:
+            wanted = round(self.course(step, count, self.start, self.grow_until)) - count
+            return error.masked_fill(wide, math.inf), wanted
         weights = error * (error > self.raised)
         wanted = max(round(SHARE * int((weights > 0).sum())) - replaced, int(wide.sum()))
         return weights.masked_fill(wide, math.inf), wanted

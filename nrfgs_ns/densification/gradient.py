@@ -12,14 +12,12 @@ from gsplat.strategy.ops import remove, reset_opa
 from torch import Tensor
 
 from nrfgs_ns.densification.statistics import take_statistics
-from nrfgs_ns.densification.strategy import Densification, DensificationConfig, OpacitySeen
+from nrfgs_ns.densification.strategy import FIRST, Densification, DensificationConfig
 
 EXTENT_MARGIN = 1.1
 """3DGS's extent of a scene: the largest distance of a training camera from their mean, times this."""
 THRESHOLD = "log_threshold"
 """Name in the strategy's `state`: logarithm of what the gradient's threshold is multiplied by, to meet a budget."""
-FIRST = "first_count"
-"""Name in the strategy's `state`: splats at the first refinement, where a budget's course starts."""
 RECOVERY = 3
 """Refinements after a reset of opacities at which a training with a budget prunes nothing."""
 DEAD_BAND = 0.01
@@ -55,7 +53,7 @@ class GradientConfig(DensificationConfig):
             reset_every=self.reset_alpha_every * self.refine_every,
             **thresholds,
         )
-        return GradientDensification(self.name, rules, self.opacity_seen, scene_unit, self.budget)
+        return GradientDensification(self, rules, scene_unit)
 
 
 @dataclass
@@ -114,13 +112,11 @@ class Original(GradientConfig):
 class PruneBySeenOpacity(DefaultStrategy):
     """gsplat's strategy with another idea of which opacity counts when splats are pruned."""
 
-    seen_opacity: Any = None
-    """Logits [N, 1] -> opacities [N]; None: the stored ones, as in gsplat."""
+    seen_opacity: Callable[[Tensor], Tensor]
+    """logits [N, 1] -> opacities [N]"""
 
     @torch.no_grad()
     def _prune_gs(self, params, optimizers, state, step) -> int:
-        if self.seen_opacity is None:
-            return super()._prune_gs(params, optimizers, state, step)
         prune = self.seen_opacity(params["opacities"]) < self.prune_opa
         if step > self.reset_every:
             prune |= params["scales"].exp().amax(dim=-1) > self.prune_scale3d * state["scene_scale"]
@@ -136,33 +132,21 @@ class GradientDensification(Densification):
     """Growth where screen-space gradients are large, pruning and resetting of opacities: splatfacto's, and 3DGS's.
 
     Args:
-        name: of the strategy.
+        config: its options. `opacity_seen` is what pruning looks at; a reset always acts on the stored one.
         strategy: gsplat's own, with this one's thresholds.
-        opacity_seen: which opacity pruning looks at. A reset always acts on the stored one.
         scene_unit: world units in a scene unit, which sizes are measured in; None: as in 3DGS, in extents of the
             cameras, and opacities are not reset at step 0, as gsplat 1.4 does: 3DGS counts its steps from 1.
-        budget: splats to have when growth ends; 0: as many as the threshold lets grow.
     """
 
-    def __init__(
-        self,
-        name: str,
-        strategy: PruneBySeenOpacity,
-        opacity_seen: OpacitySeen,
-        scene_unit: float | None,
-        budget: int = 0,
-    ):
-        super().__init__(opacity_seen)
-        self.name = name
-        self.strategy = strategy
+    def __init__(self, config: GradientConfig, strategy: PruneBySeenOpacity, scene_unit: float | None):
+        super().__init__(config)
+        self.strategy, strategy.seen_opacity = strategy, self.seen_opacity
         self.bounds = {name: getattr(strategy, name) for name in STRATEGY_BOUNDS}
         self.measure_by_cameras = scene_unit is None
-        self.budget, self.threshold, self.widest = budget, strategy.grow_grad2d, strategy.grow_scale2d
-        if budget:
+        self.threshold, self.widest = strategy.grow_grad2d, strategy.grow_scale2d
+        if self.budget:
             self.state |= {THRESHOLD: 0.0, FIRST: None}
         self.state |= strategy.initialize_state(scene_scale=scene_unit or 1.0)
-        if opacity_seen == "peak":
-            strategy.seen_opacity = self.seen_opacity
 
     def needs_absgrad(self, step: int) -> bool:
         return self.strategy.absgrad and step < self.strategy.refine_stop_iter
@@ -233,16 +217,11 @@ class GradientDensification(Densification):
     def _threshold_for_budget(self, step: int, count: int) -> float:
         """The gradient above which splats grow now, for as many as the budget by the end of growth.
 
-        With x the share of growth that is over, the course of the number is N0 + (2x - x^2) (budget - N0). Where the
-        number is off it, the logarithm of the threshold moves, by at most `LARGEST_STEP`. No more splats grow by
-        their gradient than bring the number to its course; wide ones may be split besides.
+        Where the number is off its `course`, the logarithm of the threshold moves, by at most `LARGEST_STEP`. No more
+        splats grow by their gradient than bring the number to its course; wide ones may be split besides.
         """
-        strategy, state = self.strategy, self.state
-        if state[FIRST] is None:
-            state[FIRST] = count
-        growth = strategy.refine_stop_iter - strategy.refine_start_iter
-        x = min((step - strategy.refine_start_iter) / max(growth - strategy.refine_every, 1), 1.0)
-        goal = state[FIRST] + (2 * x - x * x) * (self.budget - state[FIRST])
+        state = self.state
+        goal = self.course(step, count, self.strategy.refine_start_iter, self.strategy.refine_stop_iter)
         if abs(count - goal) > DEAD_BAND * goal:
             move = math.log(count / goal)
             state[THRESHOLD] += max(-LARGEST_STEP, min(move, LARGEST_STEP))

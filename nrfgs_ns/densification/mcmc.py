@@ -11,7 +11,6 @@ from torch import Tensor
 from nrfgs_ns.densification.relocation import add_noise, add_samples, relocate
 from nrfgs_ns.densification.strategy import (
     CHANGE,
-    CHANGE_BEFORE,
     Densification,
     DensificationConfig,
     OpacitySeen,
@@ -59,18 +58,14 @@ class McmcDensification(Densification):
     """Relocation, growth to a budget, and noise (`relocation.py`).
 
     Which opacity is seen decides that a splat is dead, and how far noise may move it. What a relocated splat gets is
-    computed from the stored opacities. The mean opacity in the loss is that of what the step's cameras are shown
+    computed from the stored opacities. The mean opacity in the loss is the one that the step's cameras are shown
     (`mean_opacity`). With the stored ones alone, splats that every view shows would count as dead, too, and the noise
     would shake them.
     """
 
-    name = Mcmc.name
-
     def __init__(self, config: Mcmc, scene_unit: float):
-        super().__init__(config.opacity_seen)
-        if config.opacity_seen == "peak":
-            self.state[CHANGE_BEFORE] = None
-        self.config, self.budget, self.scene_unit = config, config.budget, scene_unit
+        super().__init__(config, windows=2)
+        self.scene_unit = scene_unit
         self.start, self.stop = config.warmup_length, config.stop_at
 
     def rests_at(self, step: int) -> bool:
@@ -95,7 +90,7 @@ class McmcDensification(Densification):
         dead = self.seen_opacity(splats["opacities"], before=False) <= MIN_OPACITY
         moved = relocate(splats, optimizers, dead, MIN_OPACITY)
         count = len(splats["means"])
-        wanted = max(min(self.config.budget, int(1.05 * count)) - count, 0)
+        wanted = max(min(self.budget, int(1.05 * count)) - count, 0)
         wanted = self.fitting(step, info, splats, optimizers, wanted)
         added = add_samples(splats, optimizers, wanted, MIN_OPACITY)
         if self.state.get(CHANGE) is not None:

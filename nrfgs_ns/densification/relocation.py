@@ -27,7 +27,7 @@ MAX_COPIES = 51
 NOISE_SHARPNESS = 100.0
 """The noise's sigmoid falls from 1 to 0 around opacity 0.005 with this slope: live splats hold still."""
 NOISE_OPACITY = 0.005
-"""Opacity at which the noise is half as large as that of an invisible splat."""
+"""Opacity at which the noise is half as large as of an invisible splat."""
 
 
 def split_evenly(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
@@ -77,20 +77,12 @@ def relocate(splats: Splats, optimizers: Optimizers, dead: Tensor, min_opacity: 
     dead_rows, live_rows = dead.nonzero()[:, 0], (~dead).nonzero()[:, 0]
     if len(dead_rows) == 0 or len(live_rows) == 0:
         return source
-    chosen, opacities, scales = _shared_places(splats, live_rows, len(dead_rows), min_opacity)
-
-    def moved(name: str, old: Tensor) -> Parameter:
-        new = old.detach().clone()
-        if name in ("opacities", "scales"):
-            new[chosen] = opacities if name == "opacities" else scales
-        new[dead_rows] = new[chosen]
-        return Parameter(new)
+    source[dead_rows] = chosen = _share_places(splats, live_rows, len(dead_rows), min_opacity)
 
     def moments(_: str, old: Tensor) -> Tensor:
         return old.index_fill(0, chosen, 0.0)
 
-    _update_param_with_optimizer(moved, moments, splats, optimizers)
-    source[dead_rows] = chosen
+    _update_param_with_optimizer(lambda _, old: Parameter(old.detach()[source]), moments, splats, optimizers)
     return source
 
 
@@ -106,33 +98,28 @@ def add_samples(splats: Splats, optimizers: Optimizers, count: int, min_opacity:
     rows = torch.arange(len(splats["means"]), device=splats["means"].device)
     if count <= 0:
         return rows
-    chosen, opacities, scales = _shared_places(splats, rows, count, min_opacity)
-
-    def grown(name: str, old: Tensor) -> Parameter:
-        new = old.detach().clone()
-        if name in ("opacities", "scales"):
-            new[chosen] = opacities if name == "opacities" else scales
-        return Parameter(torch.cat([new, new[chosen]]))
+    source = torch.cat([rows, _share_places(splats, rows, count, min_opacity)])
 
     def moments(_: str, old: Tensor) -> Tensor:
         return torch.cat([old, old.new_zeros(count, *old.shape[1:])])
 
-    _update_param_with_optimizer(grown, moments, splats, optimizers)
-    return torch.cat([rows, chosen])
+    _update_param_with_optimizer(lambda _, old: Parameter(old.detach()[source]), moments, splats, optimizers)
+    return source
 
 
-def _shared_places(splats: Splats, rows: Tensor, count: int, min_opacity: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Draw `count` of `rows`, and what each drawn splat and its copies become.
+def _share_places(splats: Splats, rows: Tensor, count: int, min_opacity: float) -> Tensor:
+    """Draw `count` of `rows` and make each of them one of several copies, in place.
 
     Returns:
-        drawn rows, int64 [count], with repetitions; their new logits [count, 1] and log scales [count, 3].
+        the drawn rows, int64 [count], with repetitions.
     """
     opacities = torch.sigmoid(splats["opacities"]).flatten()
     chosen = rows[torch.multinomial(opacities[rows], count, replacement=True)]
     copies = torch.bincount(chosen, minlength=len(opacities))[chosen] + 1  # the drawn splat stays as one of them
     each, scales = split_evenly(opacities[chosen], splats["scales"][chosen].exp(), copies)
     each = each.clamp(min_opacity, 1.0 - torch.finfo(each.dtype).eps)
-    return chosen, torch.logit(each)[:, None], scales.log()
+    splats["opacities"].data[chosen], splats["scales"].data[chosen] = torch.logit(each)[:, None], scales.log()
+    return chosen
 
 
 @torch.no_grad()

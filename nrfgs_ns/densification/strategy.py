@@ -38,6 +38,8 @@ memory that there were; None: it was never short."""
 NEAR = 1.1
 """Estimates of the most splats that are farther above their number than this do not end growth: they are low, because
 what does not grow, images above all, counts as growing with the splats."""
+FIRST = "first_count"
+"""Name, in a strategy's `state`, of the number of splats at the first refinement, where a budget's course starts."""
 UNSEEN = -2.0
 """Change of a splat that no view has shown: less than any change."""
 
@@ -70,6 +72,15 @@ def seen_with(stored: Tensor, change: Tensor) -> Tensor:
     """The opacities that views with these changes show, in [0, 1]; the stored ones where the change is `UNSEEN`."""
     change = torch.where(change > UNSEEN, change, 0.0)
     return torch.where(change < 0, stored * (1 + change), stored + change).clamp_max(1.0)
+
+
+def per_splat(state: Mapping[str, Any], count: int) -> dict[str, Tensor]:
+    """The entries of a state that have a row for each of `count` splats."""
+    return {
+        name: value
+        for name, value in state.items()
+        if isinstance(value, Tensor) and value.dim() > 0 and len(value) == count
+    }
 
 
 @dataclass
@@ -143,21 +154,26 @@ class Shown(NamedTuple):
 
 
 class Densification(ABC):
-    """What the model asks of a strategy. `state` is all that a continued training needs, and goes into checkpoints."""
+    """What the model asks of a strategy. `state` is all that a continued training needs, and goes into checkpoints.
 
-    name: str
+    Args:
+        config: its options.
+        windows: between refinements, 1 or 2, whose views `seen_opacity` looks at.
+    """
+
     state: dict[str, Any]
     """Numbers, tuples of them, tensors with a row per splat, or None for what the first step has to make."""
     verbose: bool = True
     """Whether refinements are printed."""
-    budget: int = 0
-    """Number of splats to grow to; 0: as many as the rules give."""
     pixels: int = 0
     """Of the largest photograph."""
 
-    def __init__(self, opacity_seen: OpacitySeen):
-        self.opacity_seen = opacity_seen
-        self.state = {HELD: None, **({CHANGE: None} if opacity_seen == "peak" else {})}
+    def __init__(self, config: DensificationConfig, windows: int = 1):
+        self.config, self.name, self.opacity_seen = config, config.name, config.opacity_seen
+        self.budget: int = config.budget
+        """Number of splats to grow to; 0: as many as the rules give."""
+        seen = (CHANGE, CHANGE_BEFORE)[:windows] if self.opacity_seen == "peak" else ()
+        self.state = {HELD: None, **dict.fromkeys(seen)}
         self.shown: Shown | None = None
 
     def needs_absgrad(self, step: int) -> bool:
@@ -234,6 +250,13 @@ class Densification(ABC):
                 held = f"growth is held at {most:,} splats a GPU, since its memory has no room for more"
                 print(f"Step {step}: {held}. Smaller images or more GPUs make room (docs/troubleshooting.md).")
         return min(wanted, max(self.state[HELD][0] - count, 0))
+
+    def course(self, step: int, count: int, start: int, stop: int) -> float:
+        """The number of splats that a training with a budget has at a refinement between `start` and `stop`: with x the
+        share of growth that is over, N0 + (2x - x^2) (budget - N0)."""
+        first = self.state[FIRST] = self.state[FIRST] or count
+        x = min((step - start) / max(stop - start - self.config.refine_every, 1), 1.0)
+        return first + (2 * x - x * x) * (self.budget - first)
 
     def least(self, number: int) -> int:
         """The least of the devices' numbers; of one device its own."""

@@ -58,7 +58,7 @@ def send_to_cameras(
     """Send each camera's device what this device's splats look like from there, and receive what others see from ours.
 
     Args:
-        projection: this device's splats in all W cameras, camera i being that of device i; M rows.
+        projection: this device's splats in all W cameras, camera i being device i's; M rows.
         width, height: size of this device's own camera, pixels.
         absgrad: let the backward pass leave `projection.means2d.absgrad`, [M, 2].
 

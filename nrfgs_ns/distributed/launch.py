@@ -17,7 +17,7 @@ from nrfgs_ns.training.stopping import SIGNALS
 
 
 def prepare(config: TrainerConfig) -> None:
-    """Called by `ns-train` before it starts the processes.
+    """Check the devices; `ns-train` calls this before it starts the processes.
 
     Raises:
         InputError: the devices are CPUs, or this machine has fewer GPUs than the training asks for.

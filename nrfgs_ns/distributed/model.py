@@ -132,7 +132,7 @@ class ShardedModel(NrfgsModel):
         return int(total), loss / total, tuple(gradient / total for gradient in gradients)
 
     def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
-        """This device's losses, whose gradients are divided by W: their sum over devices is that of the mean loss.
+        """This device's losses, whose gradients are divided by W: summed over devices they are the mean loss's.
 
         Means over splats are means over the shard here, and are weighted by the shard's share of the splats.
         """
@@ -170,7 +170,7 @@ class ShardedModel(NrfgsModel):
 
         The statistics multiply gradients by the number of cameras, which undoes the mean of the losses: each (camera,
         splat) pair counts as in a step of its own. Where cameras differ in size, gradients and radii are brought to
-        that of the first. Of a splat's radii all are the largest.
+        the first one's. Of a splat's radii all are the largest.
         """
         info = self.info
         width, height = self.sizes[0]

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
-from nrfgs_ns.densification.rows import per_splat
+from nrfgs_ns.densification.strategy import per_splat
 from nrfgs_ns.distributed import comm
 
 PREFIX = "gauss_params."

@@ -13,7 +13,7 @@ import torch
 import torch.distributed as dist
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.scripts.train import _set_random_seed
-from nerfstudio.utils import comms, profiler
+from nerfstudio.utils import comms
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.optim import Optimizer
@@ -52,7 +52,6 @@ class ShardedPipeline(NrfgsPipeline):
         self.world_size = world_size
         torch.manual_seed(torch.initial_seed() + 1 + comm.rank())
 
-    @profiler.time_function
     def get_train_loss_dict(self, step: int, graphs: None = None):
         """One camera for each device; see `NrfgsPipeline.get_train_loss_dict`."""
         cameras, batch = self.datamanager.next_train_views(comm.world(), comm.rank())
@@ -156,7 +155,7 @@ class ShardedGuard(Guard):
             raise self._together(stopped) from None
 
     def _together(self, stopped: TrainingStopped | None) -> TrainingStopped:
-        """One exception for all devices: that of the first whose own image or loss is bad, which spreads to all
+        """One exception for all devices: from the first whose own image or loss is bad, which spreads to all
         gradients; otherwise of the first that found something itself."""
         mine = None if stopped is None else (str(stopped), stopped.step, stopped.origin, stopped.savable)
         stops = [(device, *stop) for device, stop in enumerate(comm.gather_objects(mine)) if stop is not None]

@@ -20,7 +20,7 @@ from nrfgs_ns.compact.finetune import REPORT_EVERY, fine_tune
 from nrfgs_ns.compact.format import container
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.options import CompactOptions
-from nrfgs_ns.files import whole, write_whole
+from nrfgs_ns.files import write_whole
 from nrfgs_ns.progress import progress
 from nrfgs_ns.threads import few_threads
 from nrfgs_ns.trained.loading import find_data, finish, load_model, lost, measure_loss
@@ -79,7 +79,7 @@ def write_file(
     """Write a compact file; returns the config.yml with which nerfstudio reads it, and numbers for a report.
 
     Args:
-        total: bytes of all that is written with a compact file of so many bytes, for `options.size_mb`.
+        total: bytes of the compact file -> bytes of all that is written, for `options.size_mb`.
     """
     model, times, rate = pipeline.model, [perf_counter()], None
     field, steps = model.field.detached(), None
@@ -100,8 +100,7 @@ def write_file(
         field = with_rank(field, basis, field.head.config.latent_dim)
     times.append(perf_counter())
     data, coarser = encoded(field, render, steps, limit, total)
-    with whole(output) as aside:
-        aside.write_bytes(data)
+    write_whole(output, data)
     times.append(perf_counter())
     decoded = decode(output)
     times.append(perf_counter())
@@ -145,30 +144,30 @@ def encoded(
     """A compact file, and the factor of its grids' steps: 1, unless all that is written would have more than `limit`
     bytes. Then it has at most these, and more than ENOUGH of them after few attempts; InputError if the coarsest file
     has more."""
-    found: dict[float, bytes] = {}  # by the logarithm (base 2) of the factor
+    files: dict[float, bytes] = {}  # by the logarithm (base 2) of the factor
 
     def attempt(log: float) -> int:
         header, streams = encode(field, render, steps, 2.0**log)
-        count = "" if limit is None else f", attempt {len(found) + 1}"
+        count = "" if limit is None else f", attempt {len(files) + 1}"
         with progress(f"Encoding{count}", len(streams)) as advance:
-            found[log] = container(header, streams, advance)
-        return total(len(found[log]))
+            files[log] = container(header, streams, advance)
+        return total(len(files[log]))
 
     log, size = 0.0, attempt(0.0)
     if limit is None or size <= limit:
-        return found[log], 1.0
+        return files[log], 1.0
     slope = (13 * len(field.splats["means"]) + field.splats["latents"].numel()) / 8  # a bit a number and doubling
-    while len(found) < MOST_ATTEMPTS and not ENOUGH * limit <= size <= limit:
+    while len(files) < MOST_ATTEMPTS and not ENOUGH * limit <= size <= limit:
         last = log, size
         log = min(max(log + (size - AIM * limit) / slope, 0.0), math.log2(COARSEST))
-        if log in found:
+        if log in files:
             break
         size = attempt(log)
         slope = max((last[1] - size) / (log - last[0]), 1.0)
-    fitting = [log for log, data in found.items() if total(len(data)) <= limit]
+    fitting = [log for log, data in files.items() if total(len(data)) <= limit]
     if not fitting:
-        raise too_small(limit, min(total(len(data)) for data in found.values()))
-    return found[best := min(fitting)], 2.0**best
+        raise too_small(limit, min(total(len(data)) for data in files.values()))
+    return files[best := min(fitting)], 2.0**best
 
 
 def too_small(limit: float, smallest: int) -> InputError:

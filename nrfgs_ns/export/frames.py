@@ -58,11 +58,11 @@ class Similarity:
 NOWHERE = Similarity(torch.eye(3).double(), 1.0, torch.zeros(3).double())
 """The identity."""
 Y_DOWN = Similarity(torch.tensor([[1, 0, 0], [0, 0, -1], [0, 1, 0]]).double(), 1.0, torch.zeros(3).double())
-"""From nerfstudio's world, whose z points up, to that of 3DGS's viewers, whose y points down."""
+"""From nerfstudio's world, whose z points up, to the world of 3DGS's viewers, whose y points down."""
 
 
 def to_capture(outputs: DataparserOutputs) -> tuple[Similarity, np.ndarray]:
-    """From the training's world to that of the original reconstruction, before an `applied_transform`, less an origin.
+    """From the training's world to the original reconstruction's, before an `applied_transform`, less an origin.
 
     The origin, float64 [3], is a point amid the cameras, to be subtracted before rounding to float32; 0 where float32
     is enough.

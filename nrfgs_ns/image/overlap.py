@@ -259,7 +259,7 @@ def _constant(count: int) -> Tensor:
 
 
 def _places(centers: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """For each scale, g's covariance of variance 1 and mean 0: eigenvalues [V], falling, and eigenvectors [V, V]."""
+    """Covariance of g at each scale, of variance 1 and mean 0: eigenvalues [V], falling, and eigenvectors [V, V]."""
     distance = torch.cdist(centers.double(), centers.double())
     spacing = distance.sort(dim=1).values[:, 1 : 1 + NEIGHBOURS].mean().clamp_min(1e-12)
     bases = []

@@ -42,9 +42,7 @@ class PhotographModel(nn.Module):
     def __init__(self, names: Sequence[str], start: Tensor | None = None, held: Sequence[Tensor] | None = None):
         super().__init__()
         self.names = list(names)
-        basis = torch.tensor(BASIS)
-        self.register_buffer("basis", basis, persistent=False)
-        self.register_buffer("exponents", (basis.T / GAMMA).contiguous(), persistent=False)
+        self.register_buffer("exponents", (torch.tensor(BASIS).T / GAMMA).contiguous(), persistent=False)
         start = torch.zeros(len(names), 3) if start is None else start.float()
         self.shots = Parameter(start - start.mean(dim=0))
         """exposure, log2(R/G) and log2(B/G) of each photograph, in stops. [P, 3]"""
@@ -64,11 +62,6 @@ class PhotographModel(nn.Module):
         """Reset the held patterns to their initial values; called after each step."""
         flat = self.shots.view(-1)
         flat.addmv_(self.held.T, torch.addmv(self.kept, self.held, flat, alpha=-1.0))
-
-    @torch.no_grad()
-    def stops(self) -> Tensor:
-        """Stops of each photograph in red, green and blue, [P, 3], on the host."""
-        return (self.shots @ self.basis).cpu()
 
     def get_extra_state(self) -> dict[str, Any]:
         return {"names": self.names}

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Splatfacto's loss, (1 - lambda) L1 + lambda (1 - SSIM), in few operations and without permuted copies.
 
-SSIM is that of Wang et al. 2004 as pytorch_msssim computes it: moments under an 11 x 11 Gaussian of sigma 1.5, at all
+SSIM is Wang et al.'s of 2004 as pytorch_msssim computes it: moments under an 11 x 11 Gaussian of sigma 1.5, at all
 places where the window lies within the image, mean over places and channels. With a prediction x and a truth y,
 
     S = A B / (C D)     A = 2 E[x] E[y] + C1        B = 2 (E[xy] - E[x] E[y]) + C2

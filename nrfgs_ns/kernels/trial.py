@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 def tried_meanwhile(trials: Sequence[Callable[[], object]], device: torch.device) -> Iterator[None]:
     """Try kernels, which compiles them, on a thread of its own while the block runs; joined at its end.
 
-    Errors are not reported here: whoever needs the kernels will meet them again.
+    Errors are not reported here: the first use of the kernels meets them again.
     """
 
     def run(trial: Callable[[], object]) -> None:

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Splatfacto with an appearance head: nerfstudio's hooks, in the order of a training.
 
-Rendering is in `renderer.py`, the loss in `loss.py`, the initial splats in `initial_splats.py`, and strategies that add
-and remove splats in `densification/`. Unlike splatfacto's, colours and opacities come from the head, nothing needs
-CUDA, metrics respect masks, and loading a checkpoint keeps the parameter objects that the optimisers hold, so that an
-interrupted training can go on.
+Rendering is in `renderer.py`, the loss in `loss.py`, the initial splats in `initial_splats.py`, what the exporter reads
+in `exported.py`, and strategies that add and remove splats in `densification/`. Unlike splatfacto's, colours and
+opacities come from the head, nothing needs CUDA, metrics respect masks, and loading a checkpoint keeps the parameter
+objects that the optimisers hold, so that an interrupted training can go on.
 """
 
 from collections.abc import Callable, Mapping
-from functools import cache
 from typing import Any
 
 import torch
@@ -21,15 +20,14 @@ from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
 from nrfgs_ns.appearance.field import Field
-from nrfgs_ns.appearance.head import AppearanceHeadConfig, SplatAppearance, base_colors
+from nrfgs_ns.appearance.head import AppearanceHeadConfig, SplatAppearance
 from nrfgs_ns.densification import Densification
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image import robust
 from nrfgs_ns.image.metrics import image_metrics
 from nrfgs_ns.image.photograph import PhotographModel
 from nrfgs_ns.model.config import NrfgsModelConfig
-from nrfgs_ns.model.harmonics_fit import DEGREE, Fit, fit_harmonics
-from nrfgs_ns.model.harmonics_tune import fine_tune
+from nrfgs_ns.model.exported import ExportedModel
 from nrfgs_ns.model.initial_splats import initial_splats
 from nrfgs_ns.model.loss import loss_of
 from nrfgs_ns.model.renderer import (
@@ -53,7 +51,7 @@ VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """Background in evaluation after training with random ones: viser's default grey, as in splatfacto."""
 
 
-class NrfgsModel(SplatfactoModel):
+class NrfgsModel(ExportedModel):
     """Gaussian splatting with an appearance head. All cameras are batches of one, [1].
 
     Args:
@@ -67,7 +65,6 @@ class NrfgsModel(SplatfactoModel):
     viewer_panel: Any = None
     """`ViewerPanel` that renders for browsers; None: no viewer"""
     _scheduled: int | None = None
-    _fit: Callable[[], Fit] | None = None
 
     def populate_modules(self):
         # Splatfacto's own populate_modules calls .cuda() and builds LPIPS, which downloads: it cannot be extended.
@@ -115,7 +112,7 @@ class NrfgsModel(SplatfactoModel):
         return initial_splats(self.config, self.head, self.seed_points, self.scene_unit)
 
     def start_from(self, seed_points: tuple[Tensor, Tensor]) -> None:
-        """Before a training: start from other points, positions [P, 3] and colours [P, 3] in 0..255."""
+        """Start a new training from other points, positions [P, 3] and colours [P, 3] in 0..255."""
         self.seed_points = seed_points
         with torch.random.fork_rng(devices=[]):  # the same on each of several devices
             torch.default_generator.manual_seed(self._seed)
@@ -241,6 +238,11 @@ class NrfgsModel(SplatfactoModel):
         view = self.project(camera)
         return self.composite(view, self.field.base_of(view))[0]["rgb"]
 
+    def set_background(self, background_color: Tensor) -> None:
+        """Set the background [3] of the viewer's pictures alone: evaluation keeps its own."""
+        if self.viewer_panel is not None:
+            self.viewer_panel.background = background_color
+
     # Training.
 
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
@@ -344,67 +346,6 @@ class NrfgsModel(SplatfactoModel):
         rgb, truth = outputs["rgb"], self.truth_of(batch, outputs["background"])
         metrics = image_metrics(rgb, truth, self.mask_of(batch)).items()
         return {name: value for name, value in metrics if value is not None}, {"img": torch.cat([truth, rgb], dim=1)}
-
-    # Viewer and exporter. The exporter reads splats with spherical harmonics from the properties below. After `fit_on`,
-    # which neither a training nor a viewer calls, they are harmonics fitted to the head (`harmonics_fit.py`).
-
-    def set_background(self, background_color: Tensor) -> None:
-        """Set the background [3] of the viewer's pictures alone: evaluation keeps its own."""
-        if self.viewer_panel is not None:
-            self.viewer_panel.set_background(background_color)
-
-    def fit_on(self, cameras: Cameras, steps: int | None = None) -> None:
-        """Fit harmonics over these cameras [V] once one of the properties below is read.
-
-        Args:
-            steps: of fine-tuning (`harmonics_tune.py`); None: as the device allows.
-        """
-
-        @cache
-        def fitted() -> Fit:
-            fit = fit_harmonics(self, cameras)
-            return fit if fit.exact else fit._replace(splats=fine_tune(self, fit.splats, cameras, steps))
-
-        self._fit = fitted
-        self.config.sh_degree = DEGREE
-
-    @property
-    def fit(self) -> Fit | None:
-        """The fitted harmonics; None without `fit_on`."""
-        return None if self._fit is None else self._fit()
-
-    def _exported(self, name: str, *missing: int) -> Tensor:
-        """A splat's numbers as a file has them; of a head without them zeros [N, *missing]."""
-        if self.fit is not None:
-            return getattr(self.fit.splats, name)
-        stored = self.gauss_params.get(name)
-        return self.means.new_zeros(self.num_points, *missing) if stored is None else stored
-
-    @property
-    def colors(self) -> Tensor:
-        return base_colors(self.features_dc)
-
-    @property
-    def opacities(self) -> Tensor:
-        return self._exported("opacities")
-
-    @property
-    def quats(self) -> Tensor:
-        return self._exported("quats")
-
-    @property
-    def features_dc(self) -> Tensor:
-        """The coefficients of the constant harmonic [N, 3]; of a head without them zeros, mid grey."""
-        return self._exported("features_dc", 3)
-
-    @property
-    def features_rest(self) -> Tensor:
-        """Coefficients of the higher harmonics [N, B, 3]; B = 0 for a head without any, unless they are fitted."""
-        return self._exported("features_rest", 0, 3)
-
-    @property
-    def shs_0(self) -> Tensor:
-        return self.features_dc
 
     # Checkpoints.
 

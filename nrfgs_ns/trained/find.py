@@ -30,7 +30,7 @@ class NamesTraining:
 
 def config_of(path: Path | None) -> Path:
     """The file at a path, or the newest config.yml in a folder (None: outputs) or up to three levels below it, which is
-    printed; InputError if there is none."""
+    printed; InputError without one."""
     if path is not None and path.is_file():
         return path
     folder = OUTPUTS if path is None else path

@@ -17,13 +17,17 @@ rasterizer does not draw them, so no gradient shows them) are removed before the
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import torch
+from gsplat.strategy.ops import _update_param_with_optimizer
 from torch import Tensor
+from torch.nn import Parameter
+from torch.optim import Optimizer
 
-from nrfgs_ns.densification.rows import take_rows
+from nrfgs_ns.densification.strategy import per_splat
 from nrfgs_ns.errors import ForTheUser
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
 
@@ -212,6 +216,22 @@ def report(pipeline, step: int, findings: Findings, limit: float) -> str:
     index = getattr(model, "watched_image", None)
     image = "of this step" if index is None else pipeline.datamanager.train_dataset.image_filenames[index]
     return "\n".join([*lines, f"Likely cause: {_cause(model, [name for name, _, _ in findings], image)}"])
+
+
+@torch.no_grad()
+def take_rows(model, optimizers: Mapping[str, Optimizer], rows: Tensor) -> None:
+    """Let the given rows, in this order, be the splats: parameters, optimisers' moments, densification's statistics.
+
+    Args:
+        model: an NrfgsModel; entries of its `gauss_params` are replaced.
+        optimizers: by group; those of `gauss_params` among them.
+        rows: of the table, int64.
+    """
+    count, state = len(model.gauss_params["means"]), model.densification.state
+    _update_param_with_optimizer(
+        lambda _, old: Parameter(old.detach()[rows]), lambda _, old: old[rows], model.gauss_params, optimizers
+    )
+    state.update({name: value[rows] for name, value in per_splat(state, count).items()})
 
 
 def _within(tensor: Tensor, limit: float) -> Tensor:

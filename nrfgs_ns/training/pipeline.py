@@ -3,7 +3,7 @@
 
 import json
 import random
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -19,6 +19,7 @@ from rich.progress import track
 from rich.table import Column, Table
 from torchvision.utils import save_image
 
+from nrfgs_ns.appearance.head import AppearanceHead
 from nrfgs_ns.compact.decode import decode, model_state
 from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
 from nrfgs_ns.densification import statistics
@@ -85,8 +86,7 @@ class NrfgsPipeline(VanillaPipeline):
             super().__init__(config, device, test_mode, **kwargs)
         self.model.viewer_panel = ViewerPanel(self.model)
         if test_mode == "val":  # ns-train; ns-eval and ns-render read the images that they need
-            kernels = load_kernels, self.model.head.try_kernels, ssim.kernels_run_on, statistics.try_kernel
-            trials = [partial(trial, self.model.device) for trial in (*kernels, optimizers.try_kernel) if on_cuda]
+            trials = [partial(trial, self.model.device) for trial in kernels_of(self.model.head) if on_cuda]
             with tried_meanwhile(trials, self.model.device):
                 self._check_smallest_image()
                 self.datamanager.load_all_images()
@@ -205,6 +205,11 @@ class NrfgsPipeline(VanillaPipeline):
         version, numbers, gauss_next = json.loads(state["python_rng"])
         random.setstate((version, tuple(numbers), gauss_next))
         self.datamanager.load_sampling_state(state["sampling"])
+
+
+def kernels_of(head: AppearanceHead) -> tuple[Callable[[torch.device], object], ...]:
+    """Trials of what a training runs on a CUDA device: gsplat's kernels, which raise what goes wrong, then Triton's."""
+    return load_kernels, head.try_kernels, ssim.kernels_run_on, statistics.try_kernel, optimizers.try_kernel
 
 
 def print_evaluation(result: Mapping[str, Any]) -> None:

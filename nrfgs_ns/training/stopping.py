@@ -2,7 +2,7 @@
 """How a training ends before its last step: by a signal, or because memory has run out.
 
 A first Ctrl-C, SIGTERM or SIGHUP (a closed terminal) lets the current step end, evaluation included, so that the state
-on disk is that of an uninterrupted training. A second Ctrl-C ends the process at once.
+on disk is the same as an uninterrupted training's. A second Ctrl-C ends the process at once.
 """
 
 import os

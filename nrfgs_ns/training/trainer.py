@@ -25,10 +25,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from nrfgs_ns.data.checks import warn
 from nrfgs_ns.densification.memory import give_back
 from nrfgs_ns.errors import ForTheUser, InputError
+from nrfgs_ns.model.initial_splats import start_with_dense_points
 from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.averaging import ParameterMean, window
 from nrfgs_ns.training.checkpoint_files import DiskFull
-from nrfgs_ns.training.dense_start import start_with_dense_points
 from nrfgs_ns.training.guard import Guard, TrainingStopped
 from nrfgs_ns.training.identity import check_options, check_scene, options_of, scene_of
 from nrfgs_ns.training.optimizers import LeanOptimizers

@@ -186,8 +186,8 @@ def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool)
         (has_near_plane, f"near plane: {near:.2g} scene units, half the depth of the nearest points"),
     )
     notes = [*pipeline.notes, *(note for holds, note in chosen if holds)]
-    one = f"{given} training view{'s' * (given != 1)}"
-    count = one if views == given else f"{views} different training views of {given}"
+    words = f"{given} training view{'s' * (given != 1)}"
+    count = words if views == given else f"{views} different training views of {given}"
     if parts:
         CONSOLE.print(f"{count}: {', '.join(parts)} (docs/captures.md).", soft_wrap=True)
     data = pipeline.datamanager.train_dataset

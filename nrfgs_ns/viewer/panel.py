@@ -91,9 +91,6 @@ class ViewerPanel(ViewerControl):
         """Whether this code runs in a render thread of nerfstudio's viewer."""
         return isinstance(threading.current_thread(), RenderStateMachine)
 
-    def set_background(self, background: Tensor) -> None:
-        self.background = background
-
     def _welcome(self, client) -> None:
         """Move a browser to a little in front of the first training photograph: nerfstudio's own first view may see
         nothing."""

@@ -28,8 +28,8 @@ from viser import _client_autobuild, _messages, infra
 from viser.infra import _infra
 
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.host import VISER
 
-VISER_READ = "0.2.7"
 LOCAL, ALL_INTERFACES = "127.0.0.1", "0.0.0.0"
 
 WIDEST = 8.0
@@ -60,10 +60,10 @@ def protect() -> None:
     if infra.WebsockServer is GuardedServer:
         return
     version = importlib.metadata.version("viser")
-    if version != VISER_READ:
+    if version != VISER:
         raise InputError(
-            f"viser {version} is installed, and the viewer is guarded in {VISER_READ} alone. Run: pip install "
-            f"viser=={VISER_READ}."
+            f"viser {version} is installed, and the viewer is guarded in {VISER} alone. Run: pip install viser=="
+            f"{VISER}."
         )
     infra.WebsockServer = GuardedServer
     # The page is built. To ask, viser looks through all processes of the machine, and fails if one of them ends then.

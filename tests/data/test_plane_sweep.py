@@ -10,7 +10,7 @@ from nerfstudio.cameras.cameras import Cameras
 from torch.nn.functional import avg_pool2d
 
 from nrfgs_ns.data import plane_sweep as sweep
-from nrfgs_ns.training.dense_start import start_with_dense_points
+from nrfgs_ns.model.initial_splats import start_with_dense_points
 
 SIZE, FOCAL, DISTANCE = 48, 60.0, 4.0
 

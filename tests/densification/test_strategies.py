@@ -3,11 +3,13 @@
 
 import math
 from copy import deepcopy
+from dataclasses import asdict
 
 import pytest
 import torch
 import yaml
 from densification_cases import REFINES, STRATEGIES, Table, logit, strategy
+from gsplat.strategy import DefaultStrategy
 from torch.testing import assert_close
 
 from nrfgs_lab.training_run import parse
@@ -147,8 +149,8 @@ def test_statistics_growth_and_resets_are_gsplats():
     for table in (ours, theirs):
         table.set_opacity(3, 0.01)
     rules = strategy("splatfacto", warmup_length=10, refine_every=5, reset_alpha_every=4)
-    gsplats = deepcopy(rules.strategy)
-    gsplats.seen_opacity, state = None, gsplats.initialize_state(scene_scale=1.0)
+    gsplats = DefaultStrategy(**asdict(rules.strategy))
+    state = gsplats.initialize_state(scene_scale=1.0)
     for step in range(60):
         torch.manual_seed(step)
         ours.step(rules, step, gradient=0.01 * (step % 3))

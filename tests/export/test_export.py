@@ -17,7 +17,6 @@ from plyfile import PlyData
 from short_trainings import command_line
 from torch.testing import assert_close
 
-from nrfgs_lab.training_run import parse
 from nrfgs_ns.appearance.head import base_colors
 from nrfgs_ns.appearance.sh import SphericalHarmonics, sh_bases
 from nrfgs_ns.compact.decode import decode
@@ -63,10 +62,7 @@ def trained(tiny_scene, tmp_path_factory):
 
 def model_on(scene: Path, out: Path, method: str = "nrfgs", *options: str):
     """An untrained model of 300 splats, and its training cameras."""
-    torch.manual_seed(0)
-    config = parse([method, "--data", str(scene), "--output-dir", str(out), *options])
-    pipeline = config.pipeline.setup(device="cpu", test_mode="test")
-    pipeline.eval()
+    pipeline = short_trainings.untrained(scene, out, method, *options, mode="test").eval()
     return pipeline.model, pipeline.datamanager.train_dataset.cameras
 
 
@@ -313,9 +309,8 @@ def test_an_independent_reader_renders_the_models_picture(trained, tmp_path):
 @pytest.mark.parametrize("mode", ["val", "test"])
 def test_trainings_and_viewers_see_the_stored_tables(mode, tiny_scene, tmp_path, monkeypatch):
     """The viewer reads every property of the model several times at its start: nothing may be fitted there."""
-    config = parse(["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path)])
-    model = config.pipeline.setup(device="cpu", test_mode=mode).model
-    monkeypatch.setattr("nrfgs_ns.model.model.fit_harmonics", None)
+    model = short_trainings.untrained(tiny_scene, tmp_path, mode=mode).model
+    monkeypatch.setattr("nrfgs_ns.model.exported.fit_harmonics", None)
     assert model.fit is None and model.shs_rest.shape == (model.num_points, 0, 3)
     for name in ("opacities", "quats", "features_dc"):
         assert getattr(model, name) is model.gauss_params[name]

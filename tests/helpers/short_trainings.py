@@ -72,6 +72,13 @@ def set_up(args: list[str]) -> NrfgsTrainer:
     return trainer
 
 
+def untrained(scene: Path, out: Path, method: str = "nrfgs", *options: Any, device="cpu", mode="val"):
+    """A pipeline before its training, without a trainer."""
+    config = parse([method, "--data", str(scene), "--output-dir", str(out), *map(str, options)])
+    torch.manual_seed(0)
+    return config.pipeline.setup(device=device, test_mode=mode)
+
+
 def trained(args: list[str]) -> Path:
     """config.yml of a training, when it has ended."""
     return Path(train(args).config_path)

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from short_trainings import command_line, trained
+from short_trainings import command_line, trained, untrained
 
-from nrfgs_lab.training_run import evaluate, parse
+from nrfgs_lab.training_run import evaluate
 from nrfgs_ns.export.command import Compact, Ply
 from nrfgs_ns.export.options import PlyOptions
 from nrfgs_ns.export.ply import read_splats
@@ -25,12 +25,9 @@ def viewer_pictures(device: str, scene: Path, out: Path) -> dict[str, torch.Tens
 
     The field is drawn at random, the same on every device.
     """
-    config = parse(["nrfgs", "--data", str(scene), "--output-dir", str(out), "--machine.device-type", device])
-    config.pipeline.model.background_color = "black"
-    config.pipeline.model.few_views = "off"
-    config.pipeline.model.appearance.precision = "fp32"  # as on the CPU
-    torch.manual_seed(0)
-    pipeline = config.pipeline.setup(device=device, test_mode="val")
+    words = "--pipeline.model.background-color black --pipeline.model.few-views off"
+    words += " --pipeline.model.appearance.precision fp32"  # as on the CPU
+    pipeline = untrained(scene, out, "nrfgs", *words.split(), device=device)
     model, cameras = pipeline.model, pipeline.datamanager.train_dataset.cameras.to(device)
     generator = torch.Generator().manual_seed(1)
     drawn = {"latents": 0.3, "scales": 0.5}

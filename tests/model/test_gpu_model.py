@@ -4,10 +4,10 @@
 import pytest
 import torch
 from nerfstudio.engine.optimizers import Optimizers
-from short_trainings import PLAIN, SMOKE_METHODS, SMOKE_STEPS, bound, command_line
+from short_trainings import PLAIN, SMOKE_METHODS, SMOKE_STEPS, bound, command_line, untrained
 from torch.testing import assert_close
 
-from nrfgs_lab.training_run import evaluate, parse, train
+from nrfgs_lab.training_run import evaluate, train
 from nrfgs_ns.appearance.sh import eval_sh
 
 pytestmark = pytest.mark.gpu
@@ -35,14 +35,10 @@ def test_one_step_is_the_same_on_both_devices(method, tiny_scene, tmp_path):
     """The same splats, camera and background: image, loss and gradients of every parameter."""
     results = {}
     for device in ("cpu", "cuda"):
-        config = parse([method, "--data", str(tiny_scene), "--output-dir", str(tmp_path)])
-        config.pipeline.model.background_color = "black"
-        config.pipeline.model.few_views = "off"
-        if method == "nrfgs":  # zero outputs would hide the layers before them
-            config.pipeline.model.appearance.output_init = "default"
-            config.pipeline.model.appearance.precision = "fp32"  # as on the CPU
-        torch.manual_seed(0)
-        pipeline = config.pipeline.setup(device=device, test_mode="val")
+        words = "--pipeline.model.background-color black --pipeline.model.few-views off"
+        if method == "nrfgs":  # zero outputs would hide the layers before them; fp32 as on the CPU
+            words += " --pipeline.model.appearance.output-init default --pipeline.model.appearance.precision fp32"
+        pipeline = untrained(tiny_scene, tmp_path, method, *words.split(), device=device)
         model = pipeline.model
         # Splats start round, and turning a round splat changes nothing: its quaternion's gradient is rounding alone.
         model.gauss_params["scales"].data += 0.5 * torch.randn(model.num_points, 3).to(device)

@@ -12,9 +12,9 @@ from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.utils.rich_utils import CONSOLE
 from pytorch_msssim import SSIM
+from short_trainings import untrained
 from torch.testing import assert_close
 
-from nrfgs_lab.training_run import parse
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.appearance.sh import ShConfig
@@ -36,13 +36,8 @@ pytestmark = pytest.mark.usefixtures("no_cuda")
 
 @pytest.fixture
 def build(tiny_scene, tmp_path):
-    def pipeline(method="nrfgs", *options):
-        words = ["--data", tiny_scene, "--output-dir", tmp_path / "out", "--pipeline.model.few-views", "off", *options]
-        config = parse([method, *map(str, words)])
-        torch.manual_seed(0)
-        return config.pipeline.setup(device="cpu", test_mode="val")
-
-    return pipeline
+    off = "--pipeline.model.few-views", "off"
+    return lambda method="nrfgs", *options: untrained(tiny_scene, tmp_path, method, *off, *options)
 
 
 def test_the_head_sees_only_what_the_camera_sees(build, monkeypatch):

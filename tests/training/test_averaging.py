@@ -12,10 +12,9 @@ from short_trainings import assert_same_training, checkpoint_of, command_line, s
 from torch.testing import assert_close
 
 from nrfgs_ns.densification.relocation import add_noise, relocate
-from nrfgs_ns.densification.rows import take_rows
 from nrfgs_ns.training import averaging
 from nrfgs_ns.training.averaging import ParameterMean, window
-from nrfgs_ns.training.guard import TrainingStopped
+from nrfgs_ns.training.guard import TrainingStopped, take_rows
 from nrfgs_ns.training.pace import Pace, TimedPace
 from nrfgs_ns.training.trainer import NrfgsTrainer
 

@@ -61,7 +61,6 @@ def test_what_steps_cost_decides_how_evenly_they_are_spread():
     """Steps at half the resolution take half the time, as the phases say: as many positions for each step early on as
     later. Without the phases the early steps look cheap for ever, and more of them are made."""
     phases = resolution_phases(1, 15_000)
-    assert phases == [(15_000.0, 0.5), (math.inf, 1.0)]
 
     def cost(position, step):
         return 0.5 if position < 15_000 else 1.0

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 import torch
 from PIL import ExifTags, Image
-from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained
+from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained, untrained
 
-from nrfgs_lab.training_run import parse
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.overlap import Pairs, estimate
-from nrfgs_ns.image.photograph import exposed
+from nrfgs_ns.image.photograph import BASIS, exposed
 from nrfgs_ns.trained.loading import load_model
 from nrfgs_ns.training.photographs import Evidence, exif_of, exposure
 
@@ -155,15 +154,14 @@ def test_renderings_have_the_mean_look_or_a_photographs(exposed_scene, finished,
 
 
 def test_what_is_behind_a_cut_out_photograph_is_exposed_with_it(tiny_scene, tmp_path):
-    words = command_line("nrfgs-sh", tiny_scene, tmp_path, 1, QUICK, {"--pipeline.model.photographs": "on"})
-    model = parse(words).pipeline.setup(device="cpu", test_mode="val").model.train()
+    model = untrained(tiny_scene, tmp_path, "nrfgs-sh", "--pipeline.model.photographs", "on").model.train()
     with torch.no_grad():
         model.photograph.shots[3] = torch.tensor([-1.0, 0.2, 0.1])
     transparent = {"image": torch.zeros(6, 8, 4, dtype=torch.uint8), "image_idx": 3}
     grey = torch.full((3,), 0.5)
     model.config.num_downscales = 0
     truth = model.truth_of(transparent, grey)
-    torch.testing.assert_close(truth, exposed(grey.expand(6, 8, 3), model.photograph.stops()[3]))
+    torch.testing.assert_close(truth, exposed(grey.expand(6, 8, 3), model.photograph.shots[3] @ torch.tensor(BASIS)))
     assert torch.equal(model.eval().truth_of(transparent, grey), grey.expand(6, 8, 3))
 
 

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 from nerfstudio.engine.optimizers import Optimizers
-from short_trainings import command_line, set_up, trained
+from short_trainings import command_line, set_up, trained, untrained
 
-from nrfgs_lab.training_run import evaluate, parse
+from nrfgs_lab.training_run import evaluate
 from nrfgs_ns.densification import STRATEGIES, UNSEEN, memory
 from nrfgs_ns.kernels import trial
 from nrfgs_ns.training import step_graph
@@ -21,12 +21,10 @@ def build(tiny_scene, tmp_path):
     """The pipeline of a training on a device, at full resolution, and its graphs."""
 
     def pipeline(device, method="nrfgs", *options):
-        config = parse([method, "--data", str(tiny_scene), "--output-dir", str(tmp_path), *options])
-        config.pipeline.model.num_downscales = 0
-        if not method.endswith("-sh"):
-            config.pipeline.model.appearance.precision = "fp32"  # bf16 makes steps of what is rounded otherwise
-        torch.manual_seed(0)
-        built = config.pipeline.setup(device=device, test_mode="val")
+        exact = ["--pipeline.model.num-downscales", 0]
+        if method == "nrfgs":
+            exact += ["--pipeline.model.appearance.precision", "fp32"]  # bf16 makes steps of what is rounded otherwise
+        built = untrained(tiny_scene, tmp_path, method, *exact, *options, device=device)
         built.model.view_noise.sigma = 0.01
         # Splats start round, and turning a round splat changes nothing: its quaternion's gradient is rounding alone.
         built.model.gauss_params["scales"].data += 0.5 * torch.randn(built.model.num_points, 3).to(device)

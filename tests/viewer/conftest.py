@@ -3,17 +3,14 @@ import threading
 
 import pytest
 from nerfstudio.viewer.viewer import Viewer
+from short_trainings import untrained
 
-from nrfgs_lab.training_run import parse
 from nrfgs_ns.viewer.server import LocalViewerConfig
 
 
 @pytest.fixture(scope="module")
 def pipeline(tiny_scene, tmp_path_factory):
-    words = ["nrfgs", "--data", str(tiny_scene), "--output-dir", str(tmp_path_factory.mktemp("out"))]
-    pipeline = parse(words).pipeline.setup(device="cpu", test_mode="val")
-    pipeline.eval()
-    return pipeline
+    return untrained(tiny_scene, tmp_path_factory.mktemp("out")).eval()
 
 
 @pytest.fixture(scope="module")

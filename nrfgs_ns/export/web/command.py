@@ -21,7 +21,7 @@ from nrfgs_ns.export.compact import load_field, write_file
 from nrfgs_ns.export.options import CompactOptions, WebOptions
 from nrfgs_ns.export.web.guide import read_notes, read_tour
 from nrfgs_ns.export.web.page import page
-from nrfgs_ns.files import whole
+from nrfgs_ns.files import write_whole
 from nrfgs_ns.image.metrics import psnr
 from nrfgs_ns.model.renderer import pinhole
 from nrfgs_ns.threads import few_threads
@@ -67,8 +67,7 @@ def export_web(
     text = page(about | guide, poster, scene if alone else SCENE, title, web.author, preview)
     contents = {output: text.encode()} if alone else {output / SCENE: scene, output / "index.html": text.encode()}
     for path, content in (contents | ({picture: poster} if preview else {})).items():
-        with whole(path) as aside:
-            aside.write_bytes(content)
+        write_whole(path, content)
     size, name = sum(map(len, contents.values())), about["photographs"][about["start"]]["name"]
     lines = [
         f"{output}: {numbers['written']:,} splats, {size / 1e6:.2f} MB; 3DGS's PLY of as many splats has "

@@ -22,7 +22,6 @@ from nrfgs_lab.pages.figures import FIGURES
 from nrfgs_lab.pages.options import PAGE, explanation, methods, own_options, page
 from nrfgs_lab.pages.tables import BLOCK, BLOCKS, ROOT, SHEET, declared, pages, written
 from nrfgs_lab.training_run import evaluate, parse, train
-from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.cli import commands
 from nrfgs_ns.training.identity import leaves
 
@@ -129,17 +128,11 @@ def test_it_trains_under_the_name_that_the_page_gives_it(tiny_scene, tmp_path, m
 def test_the_page_of_options_is_current_and_explains_each():
     assert PAGE.read_text(encoding="utf-8") == page(), "write it again: python -m nrfgs_lab.pages.options"
     options = [option for method in methods() for option in own_options(method.config)]
-    assert len(options) > 100
     assert [option.flag for option in options if not option.text] == []
     loaded = [one.load() for one in commands().values()]
     fields = [(command, field.name) for command in loaded for field in dataclasses.fields(command)]
     assert len(fields) > 30
     assert [(command.__name__, name) for command, name in fields if not explanation(command, name)] == []
-    flags = {option.flag for option in own_options(methods()[0].config)}
-    fields = {field.name.replace("_", "-") for field in dataclasses.fields(NrfConfig) if field.name[0] != "_"}
-    assert {f"pipeline.model.appearance.{name}" for name in fields} <= flags
-    assert "time-budget" in flags and "pipeline.model.densification" in flags
-    assert not any("sh-degree" in flag or "num-downscales" in flag for flag in flags)  # suppressed; splatfacto's
 
 
 def test_the_page_has_the_commands_that_were_run():
