@@ -39,8 +39,7 @@ class Bench:
     """Compare methods over strategies, scenes and seeds: train all, and report. See docs/bench.md."""
 
     spec: Annotated[Path, tyro.conf.Positional]
-    """YAML file with runs or knobs, strategies, scenes, seeds, ..., or a name: captures, exposure, methods, opacity,
-    pixel, tiny or tradeoff; options given here override it"""
+    """YAML file with runs or knobs, strategies, scenes, ..., or a name in nrfgs_lab/bench/plans; options override it"""
     plan: str = ""
     """the plan to run, of a file with several"""
     scenes: Path = Path(".")

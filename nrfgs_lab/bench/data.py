@@ -41,7 +41,7 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
     scale = [] if scene.downscale is None else ["--downscale-factor", str(scene.downscale)]
     if scene.held_out is not None or scene.views is not None:
         with FileLock(mirror.with_name(f"{mirror.name}.lock")):
-            if not (mirror / "transforms.json").exists():
+            if not mirrors_already(mirror, folder):
                 select_views(folder, mirror, scene)
             write_smaller(mirror, mirror, scene.downscale)
         return ["nrfgs-data", "--data", str(mirror), *scale, *scene.options]
@@ -50,6 +50,7 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
         if scene.downscale is not None:
             mirror = mirror.with_name(f"{mirror.name} in {scene.downscale}")
             with FileLock(mirror.with_name(f"{mirror.name}.lock")):
+                mirrors_already(mirror, folder)
                 folder = write_smaller(folder, mirror, scene.downscale)
         return ["nrfgs-data", "--data", str(folder), *split, *scale, *scene.options]
     model = find_colmap(folder)
@@ -64,6 +65,16 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
     mirror_with_split(folder, model, mirror)
     parser = ["colmap", "--data", str(mirror), "--colmap-path", model, "--downscale-factor", str(scene.downscale or 1)]
     return [*parser, *scene.options]
+
+
+def mirrors_already(mirror: Path, folder: Path) -> bool:
+    """Whether there is a whole mirror of this folder; one of another, or part of one, is removed."""
+    note, here = mirror / "mirror-of", str(folder.resolve())
+    whole_one = note.is_file() and note.read_text(encoding="utf-8") == here and (mirror / "transforms.json").exists()
+    if not whole_one:
+        shutil.rmtree(mirror, ignore_errors=True)
+        write_whole(note, here)
+    return whole_one
 
 
 def held_out_views(names: list[str], first: int, every: int = TEST_EVERY) -> list[str]:
@@ -87,10 +98,10 @@ def select_views(folder: Path, out: Path, scene: Scene) -> None:
     file = folder / "transforms.json"
     meta = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
     if not meta.get("train_filenames"):
-        raise InputError(f"{file} names no train_filenames. Give a capture that names its split (nrfgs prepare does).")
+        fix = "For views and held_out give a capture that nrfgs prepare wrote"
+        raise InputError(f"{file} is missing, or names no train_filenames. {fix}.")
     names = sorted(meta["train_filenames"])
     if scene.held_out is None:
-        out.mkdir(parents=True)
         for entry in folder.iterdir():
             if entry != file:
                 (out / entry.name).symlink_to(entry.resolve())
@@ -100,9 +111,12 @@ def select_views(folder: Path, out: Path, scene: Scene) -> None:
         _halve(meta, folder, out)
         if scene.held_out_by == "place":
             names = by_place(names, meta["frames"])
-            test = np.array_split(names, scene.held_out_every)[scene.held_out].tolist()
+            blocks = np.array_split(names, scene.held_out_every)
+            test = blocks[scene.held_out].tolist() if scene.held_out < len(blocks) else []
         else:
             test = held_out_views(names, scene.held_out, scene.held_out_every)
+        if not test:
+            raise InputError(f"held_out: {scene.held_out} holds out none of the {len(names)} views of {file}.")
         names = [name for name in names if name not in test]
         meta |= {"test_filenames": test, "val_filenames": test}
     meta["train_filenames"] = [names[i] for i in evenly_spaced(len(names), scene.views or len(names))]

@@ -58,10 +58,8 @@ class _Loader(yaml.SafeLoader):
 
 
 def load_spec(path: Path, plan: str = "") -> dict[str, Any]:
-    """Content of a YAML file, or of one of its `plans`, for `make_spec`; InputError if it cannot be read.
-
-    Where there is no such file, the path may be the name of one in `PLANS`.
-    """
+    """Content of a YAML file, or of one of its `plans`, for `make_spec`; InputError if it cannot be read. The path may
+    be a name in `PLANS`."""
     shipped = PLANS / f"{path}.yaml"
     path = shipped if shipped.is_file() and not path.is_file() else path
     try:

@@ -79,14 +79,10 @@ def trial_changes(sitting: str) -> str:
     runs, changes = records("trials"), defaultdict(list)
     for key, one in runs.items():
         at, _, trial = one.get("name", "").partition(": ")
-        base = (
-            runs.get(key.replace(one["name"], f"{sitting}: default")) if at == sitting and trial != "default" else None
-        )
-        if base:
+        base = runs.get(key.replace(trial, "default", 1)) if at == sitting else None
+        if base and base is not one:
             changes[trial].append(one["psnr"] - base["psnr"])
-    return "; ".join(
-        f"{trial} {signed(fmean(dB), 2)}±{stdev(dB) / len(dB) ** 0.5:.2f}" for trial, dB in changes.items()
-    )
+    return "; ".join(f"{name} {signed(fmean(dB), 2)}±{stdev(dB) / len(dB) ** 0.5:.2f}" for name, dB in changes.items())
 
 
 def logit() -> str:

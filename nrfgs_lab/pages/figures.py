@@ -10,11 +10,10 @@ from functools import partial
 from itertools import product
 from statistics import median
 
-from nrfgs_lab.pages.few_views import FEWER, FIELD, SAME, sparse_runs, today
+from nrfgs_lab.pages.few_views import FIELD, SAME, sparse_runs, today
 from nrfgs_lab.pages.files import CAPTURES, reports
 from nrfgs_lab.pages.methods import COUNTS, CURVES, HEADS_OF, RULES_OF, SEATS_OF, Labels, equal
 from nrfgs_lab.pages.runs import ROOT, VIEWS, bench_rows, mean_of, records, view_gains
-from nrfgs_lab.pages.speed import PRESETS
 from nrfgs_ns.files import write_whole
 
 WIDTH, LEFT, ROW = 640, 130, 34
@@ -32,7 +31,7 @@ def svg(height: float, parts: list[str]) -> str:
 def views() -> str:
     """Gain of the field over harmonics with the same rules in each test view, a dot each; bars are medians."""
     rows = {(views, scene): (today(scene, FIELD), today(scene, SAME)) for scene, views in VIEWS.items()}
-    rows |= {(views, "bonsai"): sparse_runs(f"{views}_views_bonsai") for views in FEWER}
+    rows |= {(views, "bonsai"): sparse_runs(f"{views}_views_bonsai") for views in (16, 24, 32)}
     gains = {f"{scene}, {views}": view_gains(*rows[views, scene]) for views, scene in sorted(rows, reverse=True)}
     least, most = (math.floor(min(map(min, gains.values()))), math.ceil(max(map(max, gains.values()))))
     height = ROW * len(gains) + 50
@@ -60,6 +59,7 @@ LINES = "#0969da", "#bc4c00", "#1a7f37", "#8250df", "#bf3989", "#808890"
 """Colours that are seen on white and on black."""
 PANEL, HIGH, SIDE = 210, 190, 40
 """Width of a panel with its numbers, height of its lines, and room beside them."""
+RUNS = "splatfacto", "nrfgs-sh", "nrfgs-fast", "nrfgs", "nrfgs-best"
 FITTED = {
     "degree": "harmonics, degree 0 to 5, least squares",
     "latent_dim": "field, latents of 4 to 16",
@@ -67,12 +67,11 @@ FITTED = {
     "bands": "field, bands 1 to 6",
 }
 """Sweep in results/express.json -> its label."""
-Points = list[tuple[float, float]]
 
 
 def axes(box: tuple[float, float, float], ticks: dict[float, str], values: list[float], title: str) -> tuple:
-    """A logarithmic axis with ticks, from a tenth below the least to one above the most, and one that holds values:
-    `at`, which places a point, and the parts. The box is left, top and right."""
+    """A logarithmic axis with ticks and one that holds values, between left, top and right: `at`, which places a point,
+    and the parts."""
     step = next(step for step in (0.01, 0.02, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0) if max(values) - min(values) < 7 * step)
     low, high = math.floor(min(values) / step + 1e-6) * step, math.ceil(max(values) / step - 1e-6) * step
     (left, top, right), least, most = box, min(ticks) / 1.1, max(ticks) * 1.1
@@ -91,7 +90,7 @@ def axes(box: tuple[float, float, float], ticks: dict[float, str], values: list[
     return at, parts
 
 
-def line(points: Points, colour: str, dashed: bool = False) -> list[str]:
+def line(points: list[tuple[float, float]], colour: str, dashed: bool = False) -> list[str]:
     """Dots, joined."""
     joined, dashes = " ".join(f"{x},{y}" for x, y in points), ' stroke-dasharray="5 4"' if dashed else ""
     dots = [f'<circle fill="{colour}" cx="{x}" cy="{y}" r="4"/>' for x, y in points]
@@ -111,8 +110,10 @@ def curves(labels: Labels, metrics: tuple[str, ...] = ("psnr",)) -> str:
     """Metrics over numbers of splats on three captures: a panel each, a line for each label's run and rule."""
     parts = []
     for (y, metric), (x, scene) in product(enumerate(metrics), enumerate(CURVES)):
-        found = [sum((equal(scene, run, count, rule) for count in COUNTS), []) for run, rule in labels.values()]
-        lines = [[(one["splats"], one[metric]) for one in runs] for runs in found]
+        lines = [
+            [(one["splats"], one[metric]) for count in COUNTS for one in equal(scene, run, count, rule)]
+            for run, rule in labels.values()
+        ]
         box = PANEL * x + SIDE, (HIGH + 62) * y + 28, PANEL * (x + 1)
         ticks, title = {count: f"{count // 1000}k" for count in COUNTS}, "dB" if metric == "psnr" else "SSIM"
         at, drawn = axes(box, ticks, [value for points in lines for _, value in points], f"{scene}, {title}")
@@ -124,14 +125,14 @@ def curves(labels: Labels, metrics: tuple[str, ...] = ("psnr",)) -> str:
 
 def seconds() -> str:
     """PSNR over seconds of `bonsai`'s trainings, alone on a GPU: before growth by error, and today's, filled."""
-    rows = {run: bench_rows("speed").get(("bonsai", "own", run)) for run in PRESETS}
-    dots = {run: (median(row.values["time s"].values()), mean_of(row, "PSNR")) for run, row in rows.items() if row}
+    rows = {run: bench_rows("speed")["bonsai", "own", run] for run in RUNS}
+    dots = {run: (median(row.values["time s"].values()), mean_of(row, "PSNR")) for run, row in rows.items()}
     one = records("trials")["one host: nrfgs/bonsai-42"]
     dots["today's nrfgs"] = one["seconds"], one["psnr"]
     ticks = {time: f"{time} s" for time in (15, 30, 60, 120, 300)}
     at, parts = axes((45, 28, WIDTH - 30), ticks, [value for _, value in dots.values()], "dB")
     for label, (time, value) in dots.items():
-        (x, y), filled = at(time, value), 1 if label not in PRESETS else 0.3
+        (x, y), filled = at(time, value), 1 if label not in RUNS else 0.3
         beside, anchor = (-10, "end") if time > 150 else (10, "start")
         parts.append(f'<circle class="better" fill-opacity="{filled}" cx="{x}" cy="{y}" r="6"/>')
         parts.append(f'<text x="{x + beside}" y="{y + 5}" text-anchor="{anchor}">{label}</text>')

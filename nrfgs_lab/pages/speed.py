@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blocks of docs/speed.md and README.md: what trainings cost."""
+"""Blocks of docs/speed.md and README.md: what trainings, steps and frames cost (`timing/scale.py`)."""
 
 from collections import defaultdict
 from statistics import median
@@ -7,11 +7,6 @@ from statistics import median
 import numpy as np
 
 from nrfgs_lab.pages.runs import records, span
-
-PRESETS = "splatfacto", "nrfgs-sh", "nrfgs-fast", "nrfgs", "nrfgs-best"
-"""A user's choices in results/speed.json."""
-
-# Steps and frames against splats and pixels (`timing/scale.py`).
 
 RENDERERS = {"nrfgs": "`nrfgs`", "nrfgs-sh": "`nrfgs-sh`", "splatfacto": "splatfacto"}
 RENDERERS |= {"gsplat": "gsplat, bare", "faster-gs": "Faster-GS, bare"}

@@ -4,18 +4,23 @@
 Nerfstudio saves a training's configuration as YAML with Python tags, and its own commands construct whatever those
 name: `!!python/object/apply:os.system` in a shared file is run. Here a file may name
 
-    configuration classes of nerfstudio (subclasses of its PrintableConfig) and dataclasses of this project
+    configuration classes of nerfstudio (subclasses of its PrintableConfig), dataclasses of this project and of packages
+    that register methods with nerfstudio, whose commands import them
     what a configuration sets up (`_target`): its default's class or a subclass of it, or an optimiser of torch
-    paths, tuples, and enums of either package
+    paths, tuples, and enums of these packages
 
 and anything else is refused with its line. Values are checked against the types of the dataclasses' fields; an option
 that is newer than the file has its default. Written for what nerfstudio 1.1.5 saves by PyYAML 6.
 """
 
 import importlib
+import os
+import re
 import types
 from dataclasses import MISSING, Field, fields, is_dataclass
 from enum import Enum
+from functools import cache
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -27,8 +32,20 @@ from nerfstudio.engine.trainer import TrainerConfig
 
 from nrfgs_ns.errors import InputError
 
-OURS = ("nrfgs_ns.", "nrfgs_lab.")
-PACKAGES = ("nerfstudio.", *OURS, "torch.optim.")
+
+@cache
+def _plugins() -> set[str]:
+    """Names of this project's packages, and of others that register methods."""
+    named = os.environ.get("NERFSTUDIO_METHOD_CONFIGS", "").split(",")
+    values = [one.value for one in entry_points(group="nerfstudio.method_configs")]
+    values += [one.partition("=")[2] for one in named]
+    return {"nrfgs_ns", "nrfgs_lab", *(re.split("[.:]", value)[0] for value in values)} - {""}
+
+
+def _is_known(name: str) -> bool:
+    """Whether a file may name this class, or one of this module."""
+    package = name.partition(".")[0]
+    return package in _plugins() or package == "nerfstudio" or name.startswith("torch.optim.")
 
 
 def read_config(path: Path) -> TrainerConfig:
@@ -90,8 +107,8 @@ class _Loader(yaml.SafeLoader):
 
 def _refuse(node: yaml.Node, name: str) -> yaml.YAMLError:
     return yaml.constructor.ConstructorError(
-        problem=f"it asks for {name!r}, which is no option of nerfstudio or nrfgs_ns. If you trust the file, "
-        "nerfstudio's own commands read it",
+        problem=f"it asks for {name!r}, which is no option of nerfstudio, nrfgs_ns or a package that registers "
+        "methods. If you trust the file, nerfstudio's own commands read it",
         problem_mark=node.start_mark,
     )
 
@@ -100,10 +117,10 @@ def _class(loader: _Loader, name: str, node: yaml.Node) -> type:
     """`!!python/name:`, a class of one of the packages. `_object` decides what it may be used for."""
     module, _, attribute = name.rpartition(".")
     try:
-        kind = getattr(importlib.import_module(module), attribute) if name.startswith(PACKAGES) else None
+        kind = getattr(importlib.import_module(module), attribute) if _is_known(name) else None
     except (ImportError, AttributeError):
         kind = None
-    if not isinstance(kind, type) or not kind.__module__.startswith(PACKAGES):
+    if not isinstance(kind, type) or not _is_known(kind.__module__):
         raise _refuse(node, name)
     return kind
 
@@ -111,7 +128,9 @@ def _class(loader: _Loader, name: str, node: yaml.Node) -> type:
 def _object(loader: _Loader, name: str, node: yaml.Node):
     """`!!python/object:`, a configuration; options that the file lacks have their defaults."""
     kind = _class(loader, name, node)
-    if not is_dataclass(kind) or not (issubclass(kind, PrintableConfig) or kind.__module__.startswith(OURS)):
+    if not is_dataclass(kind) or not (
+        issubclass(kind, PrintableConfig) or kind.__module__.partition(".")[0] in _plugins()
+    ):
         raise _refuse(node, name)
     config = kind.__new__(kind)
     yield config
