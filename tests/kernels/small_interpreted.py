@@ -71,10 +71,9 @@ def test_the_kernel_raises_what_its_twin_raises(grows, peak, visible):
 
 
 # The tiles' lists, against every pixel of every tile.
-@pytest.mark.parametrize("side", [8, 16])
-def test_tiles_list_what_draws_in_them(side):
+@pytest.mark.parametrize("shape", [(13, 9, 8), (7, 5, 16)])
+def test_tiles_list_what_draws_in_them(shape):
     of = splats(200, 100, 70)
-    shape = -(-100 // side), -(-70 // side), side
     lists = tile_lists(*of, *shape)
     assert assert_lists(*lists, of, *shape, TILE_SIZE) <= 0.1 * len(lists[1])
 
@@ -82,8 +81,8 @@ def test_tiles_list_what_draws_in_them(side):
 def test_the_most_tiles():
     """A splat in the last tile of row 249, of 256 with the row below the image."""
     one = torch.ones(1)
-    of = Splats(torch.tensor([[2044.0, 1996.0]]), one.int(), one, torch.tensor([[1.0, 0.0, 1.0]]), one)
-    begins, rows = tile_lists(*of, 256, 255, 8)
+    last = torch.tensor([[2044.0, 1996.0]]), one.int(), one, torch.tensor([[1.0, 0.0, 1.0]]), one
+    begins, rows = tile_lists(*last, 256, 255, 8)
     assert begins.flatten().tolist() == [0] * 250 * 256 + [1] * 6 * 256 and rows.tolist() == [0]
 
 

@@ -10,14 +10,8 @@ import pytest
 import yaml
 
 from nrfgs_ns import method_config
-from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.training import config_file
 from nrfgs_ns.training.config_file import read_config
-
-
-class LinearConfig(NrfConfig):
-    """A head's options, of another package."""
 
 
 @pytest.fixture
@@ -32,16 +26,6 @@ def read(tmp_path):
 @pytest.mark.parametrize("name", ["nrfgs_best", "nrfgs_gsnb"])
 def test_what_is_saved_is_read_back(read, name):
     config = replace(getattr(method_config, name).config, data=Path("/some where/scène"))
-    assert read(yaml.dump(config)) == config
-
-
-def test_a_head_of_a_package_that_registers_methods_is_read_back(read, monkeypatch):
-    model = replace(method_config.nrfgs.config.pipeline.model, appearance=LinearConfig())
-    config = replace(method_config.nrfgs.config, pipeline=replace(method_config.nrfgs.config.pipeline, model=model))
-    with pytest.raises(InputError, match="LinearConfig"):
-        read(yaml.dump(config))
-    monkeypatch.setenv("NERFSTUDIO_METHOD_CONFIGS", f"linear={LinearConfig.__module__}:linear")
-    monkeypatch.setattr(config_file, "_plugins", config_file._plugins.__wrapped__)
     assert read(yaml.dump(config)) == config
 
 

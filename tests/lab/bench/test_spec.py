@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.utils.eval_utils import eval_setup  # noqa: F401  (registers the data parsers once, before the timing)
 from PIL import ExifTags, Image
 from small_colmap import Model
@@ -45,16 +44,6 @@ def test_shipped_files_are_valid():
     for plan in plans().values():
         cells = cells_of(plan)
         assert {cell.run for cell in cells} == set(plan.runs) and {cell.scene for cell in cells} == set(plan.scenes)
-
-
-def test_heads_of_others_have_the_strategies(monkeypatch):
-    """A method is this project's by its trainer, not by its name."""
-    monkeypatch.setenv("NERFSTUDIO_METHOD_CONFIGS", "linear=my_head:linear,other=x:y")
-    for name, like in (("linear", "nrfgs-sh"), ("other", "splatfacto")):
-        monkeypatch.setitem(all_methods, name, all_methods[like])
-    assert cells_of(spec(runs={"mine": {"method": "linear", "strategies": ["error-guided"]}}))
-    with pytest.raises(InputError, match="other knows no strategy"):
-        spec(runs={"theirs": {"method": "other", "strategies": ["error-guided"]}})
 
 
 def test_which_trainings_a_plan_has():

@@ -17,12 +17,14 @@ from nerfstudio.plugins.registry import discover_methods
 from nerfstudio.utils import eval_utils
 from short_trainings import command_line, recorded
 
+from nrfgs_lab.bench.spec import is_ours
 from nrfgs_lab.pages import site, tables
 from nrfgs_lab.pages.figures import FIGURES
 from nrfgs_lab.pages.options import PAGE, explanation, methods, own_options, page
 from nrfgs_lab.pages.tables import BLOCK, BLOCKS, ROOT, SHEET, declared, pages, written
 from nrfgs_lab.training_run import evaluate, parse, train
 from nrfgs_ns.cli import commands
+from nrfgs_ns.training import config_file
 from nrfgs_ns.training.identity import leaves
 
 PAGES = {str(page.relative_to(ROOT)): page.read_text(encoding="utf-8") for page in pages()}
@@ -119,7 +121,10 @@ def test_it_trains_under_the_name_that_the_page_gives_it(tiny_scene, tmp_path, m
     monkeypatch.setattr(method_configs, "AnnotatedBaseConfigUnion", tyro.extras.subcommand_type_from_defaults(configs))
     refining = {"--pipeline.model.densification": "splatfacto,warmup_length=5,refine_every=10"}
     plain = {"--pipeline.model.num-downscales": 0, "--logging.local-writer.enable": None}  # a flag here
+    assert is_ours("linear")
     record = train(command_line("linear", tiny_scene, tmp_path, 25, refining, plain))
+    monkeypatch.setattr(config_file, "_plugins", config_file._plugins.__wrapped__)
+    config_file.read_config(Path(record.config_path))
     state = torch.load(next(tmp_path.rglob("*.ckpt")), weights_only=True)["pipeline"]
     assert state["_model.gauss_params.slopes"].abs().max() > 0
     assert evaluate(record.config_path, tmp_path / "eval.json")["psnr"] > recorded()["tiny/nrfgs-sh"]["after_one_step"]
