@@ -63,10 +63,11 @@ def test_a_training_is_named_in_any_form(tmp_path, monkeypatch, capsys):
     newest, older = (run / "config.yml" for run in runs)
     monkeypatch.chdir(tmp_path)
     assert config_of(newest) == newest and capsys.readouterr().out == ""
-    for path, config in ((runs[1], older), (older.parents[1], older), (tmp_path / "outputs", newest)):
-        assert config_of(path) == config
-    assert config_of(None).resolve() == newest
+    for path, config in ((runs[1], older), (older.parents[1], older), (tmp_path / "outputs", newest), (None, newest)):
+        assert config_of(path).resolve() == config
     assert f"Training: {newest.relative_to(tmp_path)}" in capsys.readouterr().out
+    write_whole(runs[1] / "nerfstudio_models" / "step-000000009.ckpt", "")
+    assert config_of(None).resolve() == older, "a training that failed has no checkpoint"
     assert NamesTraining(load_config=older).config() == NamesTraining(older).config() == older
     with pytest.raises(InputError, match="Give one"):
         NamesTraining(older, load_config=older).config()

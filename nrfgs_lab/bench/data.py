@@ -68,8 +68,9 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
 
 
 def mirrors_already(mirror: Path, folder: Path) -> bool:
-    """Whether there is a whole mirror of this folder; one of another, or part of one, is removed."""
-    note, here = mirror / "mirror-of", str(folder.resolve())
+    """Whether there is a whole mirror of this folder as it is; one of another, or part of one, is removed."""
+    note, file = mirror / "mirror-of", folder / "transforms.json"
+    here = f"{folder.resolve()}, {file.stat().st_mtime_ns if file.is_file() else 0}"
     whole_one = note.is_file() and note.read_text(encoding="utf-8") == here and (mirror / "transforms.json").exists()
     if not whole_one:
         shutil.rmtree(mirror, ignore_errors=True)
@@ -98,8 +99,7 @@ def select_views(folder: Path, out: Path, scene: Scene) -> None:
     file = folder / "transforms.json"
     meta = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
     if not meta.get("train_filenames"):
-        fix = "For views and held_out give a capture that nrfgs prepare wrote"
-        raise InputError(f"{file} is missing, or names no train_filenames. {fix}.")
+        raise InputError(f"{file} is missing, or names no train_filenames. Give a capture that nrfgs prepare wrote.")
     names = sorted(meta["train_filenames"])
     if scene.held_out is None:
         for entry in folder.iterdir():

@@ -29,8 +29,8 @@ class NamesTraining:
 
 
 def config_of(path: Path | None) -> Path:
-    """The file at a path, or the newest config.yml in a folder (None: outputs) or up to three levels below it, which is
-    printed; InputError without one."""
+    """The file at a path, or the newest config.yml in a folder (None: outputs) or up to three levels below it, of those
+    with checkpoints if there are any, which is printed; InputError without one."""
     if path is not None and path.is_file():
         return path
     folder = OUTPUTS if path is None else path
@@ -40,6 +40,7 @@ def config_of(path: Path | None) -> Path:
     configs = [config for depth in range(4) for config in folder.glob("*/" * depth + "config.yml")]
     if not configs:
         raise InputError(f"{folder}: no config.yml in this folder or below. Name the folder of a training.")
-    newest = max(configs, key=lambda config: config.stat().st_mtime)
+    trained = [config for config in configs if any(config.parent.glob("nerfstudio_models/*.ckpt"))]
+    newest = max(trained or configs, key=lambda config: config.stat().st_mtime)
     print(f"Training: {newest}", flush=True)
     return newest
