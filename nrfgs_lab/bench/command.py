@@ -16,6 +16,7 @@ import subprocess
 import sys
 import time
 from dataclasses import asdict, dataclass
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated
 
@@ -26,7 +27,7 @@ from nrfgs_lab.bench.data import parser_options
 from nrfgs_lab.bench.file import as_list, load_spec, make_spec, scene_path
 from nrfgs_lab.bench.job import Job, command, differences, identity, read_record
 from nrfgs_lab.bench.report import FAILURE, report
-from nrfgs_lab.bench.spec import DEFAULT, Cell, Scene, Spec, cells_of, plugins, steps_of
+from nrfgs_lab.bench.spec import DEFAULT, Cell, Scene, Spec, cells_of, steps_of
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import check_writable, write_whole
 
@@ -228,7 +229,7 @@ def say(text: str) -> None:
 
 def is_method(name: str) -> bool:
     """Whether ns-train has a method of this name."""
-    if name in plugins():
+    if name in {plugin.name for plugin in entry_points(group="nerfstudio.method_configs")}:
         return True
     from nerfstudio.configs.method_configs import all_methods  # takes seconds, and is only needed for others' methods
 

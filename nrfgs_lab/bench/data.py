@@ -37,7 +37,7 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
     Mirrored and held-out data sets are written below `mirrors`. InputError if the folder has neither layout, or the
     downscaled images are missing.
     """
-    folder, mirror = root / scene.path, mirrors / scene.name
+    folder, mirror = root / scene.path, mirrors / scene.name.replace("/", ", ")  # a folder in a mirror may be a link
     scale = [] if scene.downscale is None else ["--downscale-factor", str(scene.downscale)]
     if scene.held_out is not None or scene.views is not None:
         with FileLock(mirror.with_name(f"{mirror.name}.lock")):
@@ -68,7 +68,7 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
 
 
 def mirrors_already(mirror: Path, folder: Path) -> bool:
-    """Whether there is a whole mirror of this folder as it is; one of another, or part of one, is removed."""
+    """Whether there is a whole mirror of this folder and its transforms.json; any other, or part of one, is removed."""
     note, file = mirror / "mirror-of", folder / "transforms.json"
     here = f"{folder.resolve()}, {file.stat().st_mtime_ns if file.is_file() else 0}"
     whole_one = note.is_file() and note.read_text(encoding="utf-8") == here and (mirror / "transforms.json").exists()

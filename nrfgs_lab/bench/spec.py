@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A benchmark: runs x strategies x scenes x seeds. `file.py` reads one, `job.py` has the command of each training."""
 
-import os
 import re
 from dataclasses import dataclass, field
 from functools import cache
-from importlib.metadata import entry_points
 
 QUIET = (
     "--vis tensorboard --steps-per-eval-image 1000000 --steps-per-eval-all-images 1000000 "
@@ -107,16 +105,10 @@ def cells_of(spec: Spec) -> list[Cell]:
     ]
 
 
-def plugins() -> set[str]:
-    """Methods that are registered with nerfstudio, by a package or by NERFSTUDIO_METHOD_CONFIGS."""
-    named = os.environ.get("NERFSTUDIO_METHOD_CONFIGS", "").split(",")
-    return {one.name for one in entry_points(group="nerfstudio.method_configs")} | {n.split("=")[0] for n in named}
-
-
 @cache
 def is_ours(method: str) -> bool:
     """Whether a method has this project's trainer, and so its strategies, and checkpoints to resume from."""
-    if method.startswith("nrfgs") or method not in plugins():
+    if method.startswith(("nrfgs", "splatfacto")):
         return method.startswith("nrfgs")
     from nerfstudio.configs.method_configs import all_methods  # takes seconds
 

@@ -40,7 +40,7 @@ def config_of(path: Path | None) -> Path:
     configs = [config for depth in range(4) for config in folder.glob("*/" * depth + "config.yml")]
     if not configs:
         raise InputError(f"{folder}: no config.yml in this folder or below. Name the folder of a training.")
-    trained = [config for config in configs if any(config.parent.glob("nerfstudio_models/*.ckpt"))]
+    trained = [config for config in configs if any(config.parent.glob("*/step-*.ckpt"))]
     newest = max(trained or configs, key=lambda config: config.stat().st_mtime)
     print(f"Training: {newest}", flush=True)
     return newest

@@ -5,7 +5,7 @@ Nerfstudio saves a training's configuration as YAML with Python tags, and its ow
 name: `!!python/object/apply:os.system` in a shared file is run. Here a file may name
 
     configuration classes of nerfstudio (subclasses of its PrintableConfig), dataclasses of this project and of packages
-    that register methods with nerfstudio, whose commands import them
+    that register methods with nerfstudio
     what a configuration sets up (`_target`): its default's class or a subclass of it, or an optimiser of torch
     paths, tuples, and enums of these packages
 
@@ -118,7 +118,7 @@ def _class(loader: _Loader, name: str, node: yaml.Node) -> type:
     module, _, attribute = name.rpartition(".")
     try:
         kind = getattr(importlib.import_module(module), attribute) if _is_known(name) else None
-    except (ImportError, AttributeError):
+    except Exception:  # whatever importing it leads to
         kind = None
     if not isinstance(kind, type) or not _is_known(kind.__module__):
         raise _refuse(node, name)
