@@ -177,9 +177,9 @@ def test_sizes_of_pictures_are_held_within_bounds(to_all, pipeline, monkeypatch)
     monkeypatch.setattr(pipeline.model.viewer_panel, "render", drawn)
     for wish, aspect in ((20_000, 1.0), (20_000, 1e5), (20_000, 1e-5), (-5, 1.0), (0, math.nan)):
         drawn.reset_mock()
-        messages = [{**CAMERA, "aspect": aspect}, update(slider, wish)]
-        send(to_all.viser_server.get_port(), messages, lambda: drawn.call_args_list and slider.value in (64, largest))
-        assert slider.value == (largest if wish > 0 else 64)
+        messages, held = [{**CAMERA, "aspect": aspect}, update(slider, wish)], largest if wish > 0 else 64
+        send(to_all.viser_server.get_port(), messages, lambda: drawn.call_args_list and slider.value == held)
+        assert slider.value == held
         cameras = [call.args[0] for call in drawn.call_args_list]
         assert all(4 <= int(side) <= largest for camera in cameras for side in (camera.width, camera.height))
 
