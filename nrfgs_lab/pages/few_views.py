@@ -143,9 +143,9 @@ def sparse() -> str:
 
 
 def by_views() -> str:
-    """Mean gain over harmonics with few of `bonsai`'s views, of the seeds that both have."""
-    gains = {views: fmean(view_gains(*sparse_runs(f"{views}_views_bonsai"))) for views in (16, 24, 32)}
-    return ", ".join(f"{signed(gain)} with {views}" for views, gain in gains.items())
+    """The verdict against harmonics with few of `bonsai`'s views, of the seeds that both have."""
+    gains = {views: view_gains(*sparse_runs(f"{views}_views_bonsai")) for views in (16, 24, 32)}
+    return "; ".join(f"{views} views {verdict(of)}: {ahead(of)}" for views, of in gains.items())
 
 
 BLOCKS = {

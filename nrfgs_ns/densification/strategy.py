@@ -85,7 +85,8 @@ def per_splat(state: Mapping[str, Any], count: int) -> dict[str, Tensor]:
 
 @dataclass
 class DensificationConfig(ABC):
-    """Options of a strategy. Steps count from 0; `reschedule` stretches them to the training."""
+    """Options of a strategy; each has a `budget`, too, the number of splats to grow to (0: as many as the rules give).
+    Steps count from 0; `reschedule` stretches them to the training."""
 
     name: ClassVar[str]
     """what it is called on the command line and in checkpoints"""

@@ -6,9 +6,8 @@ gsplat lists a splat in every tile of the square of three standard deviations ar
     opacity exp(-sigma) < 1 / 255        sigma = 1/2 (a dx^2 + c dy^2) + b dx dy,  (a, b, c) the conic.
 
 Here a splat is listed in those tiles of its square that have a pixel's centre in that ellipse (Feng et al., FlashGS,
-and Hanson et al., Speedy-Splat, 2024). Images and gradients are gsplat's, also with tiles of half its side: the square
-is made of its tiles. They have shorter lists, of which the longest decides how long the drawing kernels take, and which
-all pixels of a tile go through.
+and Hanson et al., Speedy-Splat, 2024). Images and gradients are gsplat's, also with tiles of half its side, since the
+square is made of its tiles. All pixels of a tile go through the tile's list, which is shorter then.
 
 An ellipse meets a row of tiles in one interval of columns, which ends at the ellipse's own leftmost and rightmost
 points, or, where these lie outside the row's band, on the band's nearer edge.

@@ -17,7 +17,7 @@ class NamesTraining:
     """Options that name a trained model."""
 
     model: tyro.conf.Positional[Path | None] = None
-    """config.yml of a training, or a folder with trainings, of which the newest counts. None: the newest in outputs"""
+    """config.yml of a training, or a folder, of whose trainings the newest with a checkpoint counts. None: outputs"""
     load_config: Path | None = None
     """the same, as ns-eval and ns-viewer call it"""
 

@@ -146,7 +146,7 @@ class StepGraphs:
         return True
 
     def _record(self, kind: tuple, seen_from: Pinhole, batch: Mapping[str, Any], index: int, step: int) -> None:
-        """Record a graph for this kind of photograph, prepared for a step; if that fails, nothing is from now on."""
+        """Record a graph for this kind of photograph, prepared for a step; if that fails, no step from now on."""
         self._see_pairs()
         self._graphs.pop(kind, None)
         try:

@@ -172,13 +172,13 @@ def update(handle, value) -> dict:
 
 def test_sizes_of_pictures_are_held_within_bounds(to_all, pipeline, monkeypatch):
     """A resolution of 20,000 and a window a thousand times as wide as it is high."""
-    slider, largest = to_all.control_panel._max_res.gui_handle, 2048
+    slider, largest, port = to_all.control_panel._max_res.gui_handle, 2048, to_all.viser_server.get_port()
     drawn = Mock(wraps=pipeline.model.viewer_panel.render)
     monkeypatch.setattr(pipeline.model.viewer_panel, "render", drawn)
     for wish, aspect in ((20_000, 1.0), (20_000, 1e5), (20_000, 1e-5), (-5, 1.0), (0, math.nan)):
         drawn.reset_mock()
         messages, held = [{**CAMERA, "aspect": aspect}, update(slider, wish)], largest if wish > 0 else 64
-        send(to_all.viser_server.get_port(), messages, lambda: drawn.call_args_list and slider.value == held)
+        send(port, messages, lambda held=held: drawn.call_args_list and slider.value == held)
         assert slider.value == held
         cameras = [call.args[0] for call in drawn.call_args_list]
         assert all(4 <= int(side) <= largest for camera in cameras for side in (camera.width, camera.height))
