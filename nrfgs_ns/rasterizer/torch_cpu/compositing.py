@@ -236,6 +236,22 @@ def _backward_block(
     return F.embedding_bag(row_of_slot[:-1], gradients, lists.splat_start, mode="sum")
 
 
+def leaves_out(*_) -> bool:
+    """Whether `composite` can leave out rows that are not finite."""
+    return False
+
+
+def composite(
+    projection: Projection, colors: Tensor, opacities: Tensor, backgrounds: Tensor | None, absgrad: bool, _: bool
+) -> tuple[Tensor, Tensor, dict]:
+    """Render [C, H, W, D] over backgrounds [C, D], alphas [C, H, W, 1], and no lists to add to `info`."""
+    tables = projection.means2d, projection.conics, opacities, colors
+    render, transmittance = CompositeSplats.apply(*tables, projection, absgrad)
+    if backgrounds is not None:
+        render = render + transmittance * backgrounds[:, None, None, :]
+    return render, 1 - transmittance, {}
+
+
 class CompositeSplats(torch.autograd.Function):
     """(means2d, conics, opacities, colors) -> (render [C, H, W, D], transmittance [C, H, W, 1])."""
 
@@ -243,11 +259,11 @@ class CompositeSplats(torch.autograd.Function):
     @full_precision()
     def forward(ctx, means2d, conics, opacities, colors, projection: Projection, absgrad: bool):
         prints = footprints(projection, opacities)
+        blocks = split_into_blocks(prints, BLOCK_PAIRS)
         size = (projection.n_cameras, projection.width, projection.height)
         sheet = Sheet(prints, colors.index_select(0, prints.rows), *size)
         final = torch.ones_like(sheet.inside)
         render = final.new_zeros(sheet.n_tiles, colors.shape[1], final.shape[1])
-        blocks = split_into_blocks(prints, BLOCK_PAIRS)
         records = []
         for block in blocks:
             lists = list_tiles(prints, block)

@@ -36,7 +36,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .. import EPS2D, ProjectionOptions
+from .. import EPS2D, Projection, ProjectionOptions
 
 FOV_MARGIN = 0.3  # how far beyond the image edge J may be evaluated, in units of tan(fov / 2)
 RADIUS_SIGMAS = 3.0  # a splat ends at this many standard deviations
@@ -143,6 +143,18 @@ def _visible(screen: _Screen, radii: Tensor, width: int, height: int, options: P
     visible = (screen.depths >= options.near_plane) & (screen.depths <= options.far_plane)
     visible &= (screen.det_blurred > 0) & (radii > 0) & (radii < LARGEST_RADIUS)
     return visible & (x + radii > 0) & (x - radii < width) & (y + radii > 0) & (y - radii < height)
+
+
+def project(geometry: tuple[Tensor, ...], cameras: tuple, options: ProjectionOptions) -> Projection:
+    """See `nrfgs_ns.rasterizer.project`: means, quats, scales; viewmats, Ks, width, height."""
+    viewmats, Ks, width, height = cameras
+    cameras = zip(viewmats, Ks, strict=True)
+    projected = [ProjectSplats.apply(*geometry, *camera, (width, height), options) for camera in cameras]
+    ids, *columns, compensations = (torch.cat(rows) for rows in zip(*projected, strict=True))
+    camera_ids = torch.cat([torch.full_like(camera[0], index) for index, camera in enumerate(projected)])
+    if options.rasterize_mode != "antialiased":
+        compensations = None
+    return Projection(camera_ids, ids, *columns, compensations, width, height, n_cameras=len(viewmats))
 
 
 class ProjectSplats(torch.autograd.Function):
