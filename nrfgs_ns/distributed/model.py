@@ -9,7 +9,6 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.densification import Densification
 from nrfgs_ns.distributed import comm
 from nrfgs_ns.distributed.exchange import send_to_cameras
@@ -18,10 +17,13 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.photograph import PhotographModel
 from nrfgs_ns.model.loss import shrinkage
 from nrfgs_ns.model.model import NrfgsModel
-from nrfgs_ns.model.renderer import Pinhole, View, project_splats, project_view, render_view
+from nrfgs_ns.model.renderer import Pinhole, View, project_splats, project_view
 from nrfgs_ns.model.view_noise import ViewNoise
 from nrfgs_ns.rasterizer import Projection
 from nrfgs_ns.training.pipeline import ShardingConfig
+
+ROWS = "camera_ids", "gaussian_ids", "radii", "means2d", "depths", "n_cameras"
+"""Columns of a projection that densification reads in `info`."""
 
 
 class ShardedModel(NrfgsModel):
@@ -83,23 +85,19 @@ class ShardedModel(NrfgsModel):
         pinholes = [self.pinhole(camera) for camera in cameras]
         self.sizes = [(one.width, one.height) for one in pinholes]
         own, field = comm.rank(), self.field
+        mine = pinholes[own]
         projection = self._project_everywhere(field.splats, pinholes)
         centers = torch.stack([one.center for one in pinholes]).index_select(0, projection.camera_ids)
-
-        arrived: SplatAppearance | None = None
-
-        def exchange(view: View, appearance: SplatAppearance) -> tuple[View, SplatAppearance]:
-            nonlocal arrived
-            absgrad = self.compositing["absgrad"]
-            drawn, arrived = send_to_cameras(view.projection, appearance, *self.sizes[own], absgrad)
-            return View(drawn, pinholes[own].center, pinhole=pinholes[own]), arrived
-
-        noise = self.view_noise.generator(self.device, self.step) if self.training else None
+        appearance = self.noisy(field).seen_from(View(projection, centers))
+        drawn, arrived = send_to_cameras(projection, appearance, *self.sizes[own], self.compositing["absgrad"])
         look = self.look_of(self._photograph_of(cameras[own]))
-        outputs, self.info = render_view(self, View(projection, centers), field, noise, look, exchange)
-        if self.training and len(arrived.colors) == 0:
-            # All devices must go backward through the exchange, the one that sees nothing too.
-            outputs["rgb"] = outputs["rgb"] + arrived.colors.sum()
+        outputs, _ = self.composite(View(drawn, mine.center, pinhole=mine), arrived, look=look)
+        self.info = {name: getattr(projection, name) for name in ROWS}  # the image's rows are other devices' splats
+        if self.training:
+            self.densification.pre_backward(self.step, self.info, appearance.opacities, field.splats["opacities"])
+            if len(arrived.colors) == 0:
+                # All devices must go backward through the exchange, the one that sees nothing too.
+                outputs["rgb"] = outputs["rgb"] + arrived.colors.sum()
         return outputs
 
     def _project_everywhere(self, splats: Mapping[str, Tensor], pinholes: list[Pinhole]) -> Projection:

@@ -25,7 +25,8 @@ from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, Similarity, to_capture
 from nrfgs_ns.export.options import PlyOptions
 from nrfgs_ns.files import whole
 from nrfgs_ns.model.harmonics_fit import PlainSplats
-from nrfgs_ns.model.renderer import Pinhole, composite_view, pinhole, project_view, projection_options
+from nrfgs_ns.model.renderer import FAR_PLANE, NEAR_PLANE, Pinhole, composite_view, pinhole, project_view
+from nrfgs_ns.rasterizer import ProjectionOptions
 from nrfgs_ns.threads import few_threads
 from nrfgs_ns.trained.loading import finish, load_model, lost, measure_loss
 
@@ -132,7 +133,7 @@ def render_splats(
 ) -> Tensor:
     """Render a file's splats over a background [3] with this project's rasterizer, [H, W, 3] in [0, 1]."""
     field = Field(ShConfig(degree=3).setup(), splats._asdict())
-    options = projection_options(rasterize_mode, scene_unit)
+    options = ProjectionOptions(rasterize_mode, NEAR_PLANE * scene_unit, FAR_PLANE * scene_unit)
     view = project_view(field.splats, _pinhole(camera, splats.means.device), options)
     return composite_view(view, field.seen_from(view), background.to(splats.means.device))[0]["rgb"]
 

@@ -7,6 +7,7 @@ opacities come from the head, nothing needs CUDA, metrics respect masks, and loa
 objects that the optimisers hold, so that an interrupted training can go on.
 """
 
+import os
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -21,6 +22,7 @@ from torch.nn import Parameter, ParameterDict
 
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import AppearanceHeadConfig, SplatAppearance
+from nrfgs_ns.data.checks import warn
 from nrfgs_ns.densification import Densification
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image import robust
@@ -30,16 +32,7 @@ from nrfgs_ns.model.config import NrfgsModelConfig
 from nrfgs_ns.model.exported import ExportedModel
 from nrfgs_ns.model.initial_splats import initial_splats
 from nrfgs_ns.model.loss import loss_of
-from nrfgs_ns.model.renderer import (
-    Pinhole,
-    Pinholes,
-    View,
-    composite_view,
-    look_asked_for,
-    project_view,
-    projection_options,
-    render_view,
-)
+from nrfgs_ns.model.renderer import FAR_PLANE, NEAR_PLANE, Pinhole, Pinholes, View, composite_view, project_view
 from nrfgs_ns.model.saved_state import check_compatible, differences, photographs_of, reduced_config
 from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.model.warmup import warm_up
@@ -47,6 +40,8 @@ from nrfgs_ns.rasterizer import ProjectionOptions
 
 NEAR_SHARE = 0.5
 """Near plane of `near_plane` auto, in the depth of the nearest points (`data.views.nearest_depth`)."""
+LOOK = "NRFGS_LOOK"
+"""Environment variable: a training photograph's file name; without it, renderings have the photographs' mean look."""
 VISER_BACKGROUND = (0.1490, 0.1647, 0.2157)
 """Background in evaluation after training with random ones: viser's default grey, as in splatfacto."""
 
@@ -125,7 +120,7 @@ class NrfgsModel(ExportedModel):
         """Learn each photograph's exposure and colour; None: all are the same."""
         self.photograph = None if photographs is None else photographs.to(self.device)
         if self.photograph is not None:
-            look_asked_for(self.photograph)  # report an unknown name now, not at the first evaluation
+            self._photograph_asked_for()  # report an unknown name now, not at the first evaluation
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         """One group for each per-splat tensor, "field" for the head's weights, and "photograph" for exposures."""
@@ -143,21 +138,6 @@ class NrfgsModel(ExportedModel):
         return self.field.bytes
 
     # Rendering.
-
-    @property
-    def field(self) -> Field:
-        """The head with all splats, or, in evaluation, those in the crop box."""
-        splats: dict[str, Tensor] = dict(self.gauss_params.items())
-        if self.crop_box is not None and not self.training:
-            inside = self.crop_box.within(splats["means"]).reshape(-1)
-            splats = {name: value[inside] for name, value in splats.items()}
-        return Field(self.head, splats)
-
-    @property
-    def projection_options(self) -> ProjectionOptions:
-        near = self.near if self.config.near_plane == "auto" else 0.0
-        # In training the guard finds numbers that are not finite.
-        return projection_options(self.config.rasterize_mode, self.scene_unit, near, assume_finite=self.training)
 
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
@@ -178,10 +158,18 @@ class NrfgsModel(ExportedModel):
             "depth" [H, W, 1].
         """
         field = self.field
-        noise = self.view_noise.generator(self.device, self.step) if self.training else None
         view, look = self.project(camera, field.splats), self.look_of(self._photograph_of(camera))
-        outputs, self.info = render_view(self, view, field, noise, look)
+        outputs, self.info = self.render_view(view, self.noisy(field), look)
         return outputs
+
+    @property
+    def field(self) -> Field:
+        """The head with all splats, or, in evaluation, those in the crop box."""
+        splats: dict[str, Tensor] = dict(self.gauss_params.items())
+        if self.crop_box is not None and not self.training:
+            inside = self.crop_box.within(splats["means"]).reshape(-1)
+            splats = {name: value[inside] for name, value in splats.items()}
+        return Field(self.head, splats)
 
     def project(self, camera: Cameras, splats: Mapping[str, Tensor] | None = None) -> View:
         """Project splats into a camera (`project_view`): the field's, or another table."""
@@ -198,15 +186,73 @@ class NrfgsModel(ExportedModel):
         risen = self.schedule_step // self.config.resolution_schedule
         return 2 ** max(self.config.num_downscales - risen, 0) if self.training else 1
 
+    @property
+    def projection_options(self) -> ProjectionOptions:
+        near, far = NEAR_PLANE * self.scene_unit, FAR_PLANE * self.scene_unit
+        if self.config.near_plane == "auto":
+            near = max(near, self.near)
+        # In training the guard finds numbers that are not finite.
+        return ProjectionOptions(self.config.rasterize_mode, near, far, assume_finite=self.training)
+
     def _photograph_of(self, camera: Cameras) -> int | None:
         """The photograph whose look a rendering has: in training the camera's own; None: the mean of all."""
         if self.training:
             return (camera.metadata or {}).get("cam_idx")
-        return None if self.photograph is None else look_asked_for(self.photograph)
+        return None if self.photograph is None else self._photograph_asked_for()
+
+    def _photograph_asked_for(self) -> int | None:
+        """The photograph that LOOK names; None, with a warning, if no exposures have been learnt.
+
+        Raises:
+            InputError: there is no such photograph.
+        """
+        name = os.environ.get(LOOK)
+        if not name:
+            return None
+        if self.photograph is None:
+            finding = "this model has learnt no photograph's exposure: all renderings have one look"
+            warn(f"{LOOK} is {name!r}, but {finding}.")
+            return None
+        names = self.photograph.names
+        if name not in names:
+            raise InputError(f"{LOOK} is {name!r}, which is not a training photograph, such as {names[0]!r}.")
+        return names.index(name)
 
     def look_of(self, index: int | None) -> Callable[[Tensor], Tensor] | None:
         """The learnt look of a photograph, for `composite_view`; None: the mean of all."""
         return None if index is None or self.photograph is None else lambda rgb: self.photograph(rgb, index)
+
+    def noisy(self, field: Field) -> Field:
+        """A field as its head sees it: in training, under noise (`view_noise.py`)."""
+        noise = self.view_noise.generator(self.device, self.step) if self.training else None
+        return field._replace(splats=self.view_noise.moved(field.splats, noise))
+
+    def render_view(
+        self, view: View, noisy: Field, look: Callable[[Tensor], Tensor] | None
+    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Render a view of a field, given as its head sees it, with a look (`look_of`): in evaluation, in the eager and
+        in the recorded step. In training, densification looks at it."""
+        appearance = noisy.seen_from(view)
+        outputs, info = self.composite(view, appearance, look=look)
+        if self.training:
+            shown, stored = appearance.opacities, noisy.splats["opacities"]
+            if view.every_row:
+                base = torch.sigmoid(stored).flatten()  # for splats that are not visible
+                shown = torch.where(info["radii"] > 0, shown, base)
+            self.densification.pre_backward(self.step, info, shown, stored)
+        return outputs, info
+
+    def composite(
+        self,
+        view: View,
+        appearance: SplatAppearance,
+        background: Tensor | None = None,
+        look: Callable[[Tensor], Tensor] | None = None,
+    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Composite any appearance of a view as this model is configured (`composite_view`), over a colour [3] instead
+        of the configuration's background if one is given, with a look (`look_of`)."""
+        background = self._get_background_color() if background is None else background
+        return composite_view(view, appearance, background, look=look, **self.compositing)
 
     @property
     def compositing(self) -> dict[str, Any]:
@@ -218,19 +264,11 @@ class NrfgsModel(ExportedModel):
             "assume_finite": self.training,
         }
 
-    def composite(
-        self, view: View, appearance: SplatAppearance, background: Tensor | None = None, photograph: int | None = None
-    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Composite any appearance of a view as this model is configured (`composite_view`), over a colour [3] instead
-        of the configuration's background if one is given, with the look of a photograph (`look_of`)."""
-        background = self._get_background_color() if background is None else background
-        return composite_view(view, appearance, background, look=self.look_of(photograph), **self.compositing)
-
     def render(self, field: Field, camera: Cameras, noisy: Field) -> dict[str, Tensor]:
         """Render any field as `get_outputs` renders the model's own; `noisy`: as its head sees it, with or without
         noise."""
         view = self.project(camera, field.splats)
-        return self.composite(view, noisy.seen_from(view), photograph=self._photograph_of(camera))[0]
+        return self.composite(view, noisy.seen_from(view), look=self.look_of(self._photograph_of(camera)))[0]
 
     @torch.no_grad()
     def get_base_color(self, camera: Cameras) -> Tensor:
@@ -392,7 +430,7 @@ class NrfgsModel(ExportedModel):
         photographs = photographs_of(state)
         if photographs is None or self.photograph is None:  # a training's optimisers hold its own
             self.photograph = None if photographs is None else photographs.to(self.device)
-        look_asked_for(self.photograph)
+        self._photograph_asked_for()
         check_compatible(self, state)
         for name, parameter in self.gauss_params.items():
             parameter.data = parameter.data.new_zeros(state[f"gauss_params.{name}"].shape)

@@ -5,11 +5,8 @@ seen_from = pinhole(camera, pose, downscale)                   # nerfstudio's ca
 view = project_view(field.splats, seen_from, options)          # which splats, and where
 appearance = field.seen_from(view)                             # their colours and opacities (`appearance/field.py`)
 outputs, info = composite_view(view, appearance, background)   # the image
-
-`render_view` is the last two as a model is configured.
 """
 
-import os
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from functools import lru_cache
@@ -20,21 +17,14 @@ from nerfstudio.cameras.camera_optimizers import CameraOptimizer
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
-from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.data.checks import warn
-from nrfgs_ns.errors import InputError
-from nrfgs_ns.image.photograph import PhotographModel
-from nrfgs_ns.rasterizer import Projection, ProjectionOptions, RasterizeMode, composite, project
+from nrfgs_ns.rasterizer import Projection, ProjectionOptions, composite, project
 
 REMEMBERED = 64
 """Cameras on a GPU whose conversion is remembered."""
 NEAR_PLANE, FAR_PLANE = 0.01, 1e10
 """Depths between which splats are drawn, in scene units: splatfacto's."""
-ROWS = "camera_ids", "gaussian_ids", "radii", "means2d", "depths", "n_cameras"
-"""What densification reads in `info` about a view's rows."""
-LOOK = "NRFGS_LOOK"
-"""Environment variable: a training photograph's file name; without it, renderings have the photographs' mean look."""
 
 
 class Pinhole(NamedTuple):
@@ -148,15 +138,6 @@ def _constants(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor
         return flip, torch.tensor([0.0, 0.0, 0.0, 1.0], device=device, dtype=dtype)
 
 
-def projection_options(
-    rasterize_mode: RasterizeMode, scene_unit: float, near: float = 0.0, *, assume_finite: bool = False
-) -> ProjectionOptions:
-    """Options of a projection with splatfacto's planes, `scene_unit` being the world units in a scene unit. The near
-    plane is at least `near` world units away."""
-    planes = max(NEAR_PLANE * scene_unit, near), FAR_PLANE * scene_unit
-    return ProjectionOptions(rasterize_mode, *planes, assume_finite=assume_finite)
-
-
 class View(NamedTuple):
     """Splats seen by one camera."""
 
@@ -238,53 +219,3 @@ def composite_view(
         depth = render[..., -1:]
         outputs["depth"] = torch.where(alpha > 0, depth, depth.detach().max())
     return outputs, info
-
-
-def render_view(
-    model,
-    view: View,
-    field: Field,
-    noise: torch.Generator | None,
-    look: Callable[[Tensor], Tensor] | None,
-    exchange: Callable[[View, SplatAppearance], tuple[View, SplatAppearance]] | None = None,
-) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Render a view of a field as an NrfgsModel is configured: in evaluation, in the eager and the recorded step, and
-    on each of several devices. In training, densification looks at it. `info` is about the view's rows.
-
-    Args:
-        view: the field's splats in a camera; with `exchange`, in those of all devices.
-        noise: generator of the noise under which the head sees the splats (`view_noise.py`); None: no noise.
-        look: as in `composite_view`.
-        exchange: this device's splats in all cameras -> all devices' splats in its own camera.
-    """
-    seen = field._replace(splats=model.view_noise.moved(field.splats, noise))
-    appearance = seen.seen_from(view)
-    drawn = (view, appearance) if exchange is None else exchange(view, appearance)
-    outputs, info = composite_view(*drawn, model._get_background_color(), look=look, **model.compositing)
-    if exchange is not None:  # the image's rows are other devices' splats
-        info = {name: getattr(view.projection, name) for name in ROWS}
-    if model.training:
-        shown, stored = appearance.opacities, field.splats["opacities"]
-        if view.every_row:
-            base = torch.sigmoid(stored).flatten()  # for splats that are not visible
-            shown = torch.where(info["radii"] > 0, shown, base)
-        model.densification.pre_backward(model.step, info, shown, stored)
-    return outputs, info
-
-
-def look_asked_for(photograph: PhotographModel | None) -> int | None:
-    """The index of the photograph that LOOK names, whose exposure and colour renderings outside of training take; None,
-    with a warning, if no exposures have been learnt.
-
-    Raises:
-        InputError: there is no such photograph.
-    """
-    name = os.environ.get(LOOK)
-    if not name:
-        return None
-    if photograph is None:
-        warn(f"{LOOK} is {name!r}, but this model has learnt no photograph's exposure: all renderings have one look.")
-        return None
-    if name not in photograph.names:
-        raise InputError(f"{LOOK} is {name!r}, which is not a training photograph, such as {photograph.names[0]!r}.")
-    return photograph.names.index(name)

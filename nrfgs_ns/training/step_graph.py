@@ -27,7 +27,7 @@ from nrfgs_ns.data.checks import warn
 from nrfgs_ns.densification import memory
 from nrfgs_ns.image.metrics import WINDOW_SIZE
 from nrfgs_ns.model.loss import loss_of
-from nrfgs_ns.model.renderer import Pinhole, composite_view, project_view, render_view
+from nrfgs_ns.model.renderer import Pinhole, composite_view, project_view
 
 MORE_ROOM = 1.5
 """Room for pairs of splats and tiles, relative to the view that has most."""
@@ -270,7 +270,8 @@ class _StepGraph:
             look = lambda rgb: functional_call(model.photograph, {"shots": shot}, (rgb, 0))  # noqa: E731
         with torch.enable_grad(), self.room.in_use():
             view = project_view(splats, self.seen_from, replace(model.projection_options, every_row=True))
-            outputs, info = render_view(model, view, Field(head, splats), self.noise, look)
+            noisy = Field(head, model.view_noise.moved(splats, self.noise))
+            outputs, info = model.render_view(view, noisy, look)
             losses = loss_of(model, splats, outputs, self.batch)
             sum(losses.values()).backward()
         self.gradients = {name: leaf.grad for name, leaf in leaves.items()}

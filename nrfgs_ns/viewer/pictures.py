@@ -100,7 +100,7 @@ def picture(
     if options.frozen_center is not None:
         view = view._replace(center=options.frozen_center.to(view.center))
     appearance = with_gain(field, view, 0.0 if options.mode == BASE else options.gain)
-    outputs, _ = model.composite(view, appearance, background, options.photograph)
+    outputs, _ = model.composite(view, appearance, background, model.look_of(options.photograph))
     if options.mode in (FULL, BASE):
         if options.stops != 0.0:
             outputs["rgb"] = exposed(outputs["rgb"], options.stops)

@@ -14,7 +14,8 @@ from nrfgs_lab.training_run import evaluate
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Compact, Ply, Web
-from nrfgs_ns.model.renderer import Pinhole, composite_view, project_view, projection_options, world_to_camera
+from nrfgs_ns.model.renderer import Pinhole, composite_view, project_view, world_to_camera
+from nrfgs_ns.rasterizer import ProjectionOptions
 from nrfgs_ns.viewer.pictures import BASE, DEPTH, FULL, PictureOptions, legends, picture
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -58,7 +59,7 @@ def test_gradients_agree_with_finite_differences(name):
 
         def forward(self, *values):
             splats = {**dict(zip(stored, values, strict=True)), "quats": quats, "scales": scales}
-            view = project_view(splats, camera, projection_options("classic", 1.0))
+            view = project_view(splats, camera, ProjectionOptions())
             seen = Field(head, splats).seen_from(view)
             return composite_view(view, seen, background, image_of=head.image_of, look=lambda rgb: rgb)[0]["rgb"]
 

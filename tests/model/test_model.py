@@ -19,17 +19,9 @@ from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.model.model import NrfgsModel
-from nrfgs_ns.model.renderer import (
-    Pinhole,
-    Pinholes,
-    composite_view,
-    pinhole,
-    project_view,
-    projection_options,
-    world_to_camera,
-)
+from nrfgs_ns.model.renderer import Pinhole, Pinholes, composite_view, pinhole, project_view, world_to_camera
 from nrfgs_ns.model.warmup import warm_up
-from nrfgs_ns.rasterizer import composite
+from nrfgs_ns.rasterizer import ProjectionOptions, composite
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -238,7 +230,7 @@ def test_a_ray_leads_to_its_pixel():
     rays = camera.rays()
     assert_close(rays.norm(dim=-1), torch.ones(7, 9, dtype=torch.float64))
     distances = torch.linspace(1, 3, 63, dtype=torch.float64)[:, None]
-    view = project_view(table(camera.center + distances * rays.view(63, 3)), camera, projection_options("classic", 1.0))
+    view = project_view(table(camera.center + distances * rays.view(63, 3)), camera, ProjectionOptions())
     rows, columns = torch.meshgrid(torch.arange(7), torch.arange(9), indexing="ij")
     centers = torch.stack([columns, rows], dim=-1).view(63, 2) + 0.5
     assert len(view.visible) == 63
@@ -251,7 +243,7 @@ def test_without_a_head_at_the_pixel_the_image_is_what_the_rasterizer_blends(wit
     torch.manual_seed(0)
     head = ShConfig(degree=1).setup()
     splats = table(torch.randn(6, 3), **head.splat_params(torch.rand(6, 3)))
-    view = project_view(splats, turned_camera(), projection_options("classic", 1.0))
+    view = project_view(splats, turned_camera(), ProjectionOptions())
     appearance = Field(head, splats).seen_from(view)
     outputs, _ = composite_view(view, appearance, BACKGROUND, with_depth=with_depth)
     render, alpha, _ = composite(view.projection, *appearance, backgrounds=BACKGROUND[None], with_depth=with_depth)
@@ -266,7 +258,7 @@ def test_without_a_head_at_the_pixel_the_image_is_what_the_rasterizer_blends(wit
 def test_the_image_of_features_is_drawn_over_the_background_and_then_exposed():
     torch.manual_seed(0)
     splats, camera = table(torch.randn(6, 3)), turned_camera()
-    view = project_view(splats, camera, projection_options("classic", 1.0))
+    view = project_view(splats, camera, ProjectionOptions())
     features = torch.rand(len(view.visible), 5)
     appearance = SplatAppearance(features, torch.full((len(features),), 0.6))
     seen = []
