@@ -16,6 +16,8 @@ FEW = list(VIEWS)[1:]
 SPARSE = {"24_views_bonsai": (24, "22.60"), "kitchen": (21, "19.24 (other views)")}
 """Scene of results/twenty-four.json -> training views, and 3DGS's PSNR with 24 at one eighth of the size, from other
 implementations (arXiv 2508.04968)."""
+HALF = {f"{views}_views_bonsai": views for views in (16, 24, 32, 64, 128)} | {"bonsai": 255}
+"""Half-size scenes there -> training views."""
 
 
 def runs_of(scene: str, name: str) -> Trainings:
@@ -143,9 +145,20 @@ def sparse() -> str:
 
 
 def by_views() -> str:
-    """The verdict against harmonics with few of `bonsai`'s views, of the seeds that both have."""
-    gains = {views: view_gains(*sparse_runs(f"{views}_views_bonsai")) for views in (16, 24, 32)}
+    """The verdict against harmonics with more and more of `bonsai`'s views."""
+    gains = {views: view_gains(*sparse_runs(scene)) for scene, views in HALF.items()}
     return "; ".join(f"{views} views {verdict(of)}: {ahead(of)}" for views, of in gains.items())
+
+
+def one_host(name: str) -> dict:
+    """A training of `bonsai` on the host on which all of these ran."""
+    return records("trials")[f"one host: {name}/bonsai-42"]
+
+
+def over_one_host() -> str:
+    """Gain there over splatfacto in the median view and in the best."""
+    gains = view_gains([one_host(FIELD)], [one_host(HOST)])
+    return f"{signed(median(gains))} and {signed(max(gains))} dB"
 
 
 BLOCKS = {
@@ -158,5 +171,7 @@ BLOCKS = {
     "captures.today": summary,
     "captures.sparse": sparse,
     "captures.by_views": by_views,
+    "captures.one_host": lambda name: f"{one_host(name)['seconds']:.0f} s",
+    "readme.over_one_host": over_one_host,
     "captures.run": lambda name: _run(records("trials")[name]),
 }

@@ -5,6 +5,7 @@ pip install -e '.[browser]'; apt-get install chromium; for Firefox: apt-get inst
 
 python -m nrfgs_lab.pages.pictures demo/outputs/*/nrfgs/*/config.yml    # docs/viewer.md: the viewer, and its modes
 python -m nrfgs_lab.pages.pictures PAGE.html OUT    # a page of `nrfgs export web`, on a desktop and on a phone
+python -m nrfgs_lab.pages.pictures THEIRS OURS    # README.md: `pictures` of two trainings of a bench with `quick: false`
 """
 
 import contextlib
@@ -14,9 +15,12 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 
+import numpy as np
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from nrfgs_lab.sheets import picture, sheet
 
@@ -31,6 +35,9 @@ WINDOWS = {"desktop": ((1280, 760), {}), "phone": ((390, 844), {"has_touch": Tru
 SHOWN = {"page": None, "view": "View", "share": "Share"}
 """Pictures of each window: the part of the panel that is open."""
 HEIGHT, BETWEEN = 600, 16  # Pixels of the picture of a page, and of the gap between its two halves.
+NAMES = "photograph", "splatfacto", "nrfgs"  # In the picture of test views.
+SWING, FRAMES = 0.35, 40  # Of the moving picture: radians to each side, and pictures.
+PICTURE = {"x": 0, "y": 0, "width": 1130, "height": 700}  # The part of the page that it shows, without the buttons.
 
 
 @contextlib.contextmanager
@@ -138,6 +145,8 @@ def page(path: Path, folder: Path) -> None:
             tab.set_default_timeout(PATIENCE)
             tab.goto(path.resolve().as_uri())
             tab.evaluate("nrfgs.ready")
+            if window == "desktop":
+                swing(tab, folder / "swing.webp")
             for name, part in SHOWN.items():
                 if part:
                     tab.get_by_role("button", name=part, exact=True).click()
@@ -149,9 +158,35 @@ def page(path: Path, folder: Path) -> None:
     sheet([shown], gap=BETWEEN).save(folder / "web.jpg", quality=85)
 
 
+def swing(tab, file: Path) -> None:
+    """Write a moving picture of a page whose camera swings about its target and back."""
+    began, shown = tab.evaluate("nrfgs.getCamera()"), []
+    position, target, up = (np.array(began[name]) for name in ("position", "target", "up"))
+    for angle in SWING * np.sin(2 * np.pi * np.arange(FRAMES) / FRAMES):
+        turned = Rotation.from_rotvec(angle * up / np.linalg.norm(up)).apply(position - target) + target
+        tab.evaluate("camera => (nrfgs.setCamera(camera), nrfgs.finished())", began | {"position": turned.tolist()})
+        shown.append(Image.open(BytesIO(tab.screenshot(clip=PICTURE))).resize((480, 297)))
+    shown[0].save(file, save_all=True, append_images=shown[1:], duration=80, loop=0, quality=55, method=6)
+    tab.evaluate("camera => nrfgs.setCamera(camera)", began)
+
+
+def beside(theirs: Path, ours: Path) -> None:
+    """Write views.jpg: the test views of the median and of the largest gain over another training, from pictures of
+    photograph and rendering side by side."""
+    rows = []
+    for files in zip(*(sorted(folder.glob("*.png")) for folder in (theirs, ours)), strict=True):
+        (truth, first), (_, second) = (np.split(np.asarray(Image.open(file)) / 255, 2, axis=1) for file in files)
+        gain = np.log(np.square(first - truth).mean() / np.square(second - truth).mean())
+        rows.append((gain, list(zip(NAMES, map(picture, (truth, first, second)), strict=True))))
+    rows.sort(key=lambda row: row[0])
+    sheet([rows[len(rows) // 2][1], rows[-1][1]], title=36, font=26).save(IMAGES / "views.jpg", quality=80)
+
+
 if __name__ == "__main__":
     first, *others = map(Path, sys.argv[1:])
-    if others:
+    if first.is_dir():
+        beside(first, *others)
+    elif others:
         page(first, *others)
     else:
         modes(first)
