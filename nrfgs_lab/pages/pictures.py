@@ -5,7 +5,7 @@ pip install -e '.[browser]'; apt-get install chromium; for Firefox: apt-get inst
 
 python -m nrfgs_lab.pages.pictures demo/outputs/*/nrfgs/*/config.yml    # docs/viewer.md: the viewer, and its modes
 python -m nrfgs_lab.pages.pictures PAGE.html OUT    # a page of `nrfgs export web`, on a desktop and on a phone
-python -m nrfgs_lab.pages.pictures THEIRS OURS    # README.md: `pictures` of two trainings of a bench with `quick: false`
+python -m nrfgs_lab.pages.pictures THEIRS OURS    # README.md: `pictures` of two benched trainings with `quick: false`
 """
 
 import contextlib
