@@ -8,8 +8,8 @@ It takes the options of `ns-train`, for one machine.
 """
 
 import contextlib
-import socket
 import sys
+from tempfile import TemporaryDirectory
 
 import torch
 import torch.distributed as dist
@@ -39,18 +39,12 @@ def join_group(rank: int, world: int, url: str, device_type: str) -> None:
     comms.LOCAL_PROCESS_GROUP = dist.new_group()
 
 
-def free_port() -> int:
-    """A port of this machine that nothing listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
 if __name__ == "__main__":
     config = parse(sys.argv[1:])
     if config.machine.num_machines > 1:
         sys.exit("machine.num_machines must be 1 here: only ns-train trains on several machines.")
     config.save_config()
     explain_losses(config)
-    with contextlib.suppress(KeyboardInterrupt):  # the processes hear Ctrl-C, too: Python waits for their last step
-        mp.spawn(work, args=(config, f"tcp://127.0.0.1:{free_port()}"), nprocs=config.machine.num_devices)
+    # The processes hear Ctrl-C, too: Python waits for their last step.
+    with contextlib.suppress(KeyboardInterrupt), TemporaryDirectory() as folder:
+        mp.spawn(work, args=(config, f"file://{folder}/meeting"), nprocs=config.machine.num_devices)

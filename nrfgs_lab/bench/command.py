@@ -16,7 +16,6 @@ import subprocess
 import sys
 import time
 from dataclasses import asdict, dataclass
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated
 
@@ -91,8 +90,10 @@ class Bench:
         jobs = self.jobs_of(plan, chosen, parsers) if parsers else {}
         pending = {name: job for name, job in jobs.items() if not self.record(name).exists()}
         if pending:
+            from nerfstudio.configs.method_configs import all_methods  # takes seconds
+
             for run in dict.fromkeys(cell.run for cell in chosen):
-                if not is_method(run.method):
+                if run.method not in all_methods:
                     raise InputError(f"{self.spec}: runs: {run.name}: {run.method!r} is no method of ns-train.")
             # A terminated benchmark must not leave its children behind; an exception reaches the `finally` below.
             signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
@@ -225,15 +226,6 @@ class Bench:
 def say(text: str) -> None:
     """Print a line of progress."""
     print(text, file=sys.stderr, flush=True)
-
-
-def is_method(name: str) -> bool:
-    """Whether ns-train has a method of this name."""
-    if name in {plugin.name for plugin in entry_points(group="nerfstudio.method_configs")}:
-        return True
-    from nerfstudio.configs.method_configs import all_methods  # takes seconds, and is only needed for others' methods
-
-    return name in all_methods
 
 
 def gpu_names(count: int) -> list[str]:

@@ -10,9 +10,11 @@
 - A smaller size that the capture has no images of: they are made, since other projects' methods only read them.
 """
 
+import contextlib
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from filelock import FileLock
@@ -46,7 +48,8 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
             write_smaller(mirror, mirror, scene.downscale)
         return ["nrfgs-data", "--data", str(mirror), *scale, *scene.options]
     if (folder / "transforms.json").is_file():
-        split = [] if names_its_split(folder / "transforms.json") else ["--eval-mode", "interval"]
+        named = any(f"{split}_filenames" in transforms_of(folder) for split in ("train", "val", "test"))
+        split = [] if named else ["--eval-mode", "interval"]
         if scene.downscale is not None:
             mirror = mirror.with_name(f"{mirror.name} in {scene.downscale}")
             with FileLock(mirror.with_name(f"{mirror.name}.lock")):
@@ -96,8 +99,7 @@ def by_place(names: list[str], frames: list[dict]) -> list[str]:
 def select_views(folder: Path, out: Path, scene: Scene) -> None:
     """Write a data set of a capture's training views at half the size, some of them held out, or of the whole capture
     with fewer training views, into `out`. InputError if the capture names no training views."""
-    file = folder / "transforms.json"
-    meta = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    file, meta = folder / "transforms.json", transforms_of(folder)
     if not meta.get("train_filenames"):
         raise InputError(f"{file} is missing, or names no train_filenames. Give a capture that nrfgs prepare wrote.")
     names = sorted(meta["train_filenames"])
@@ -147,12 +149,9 @@ def write_smaller(folder: Path, mirror: Path, downscale: int | None) -> Path:
     smaller = folder / f"images_{downscale}"
     if downscale is None or smaller.is_symlink() or (folder != mirror and smaller.is_dir()):
         return folder
-    try:
-        frames = json.loads((folder / "transforms.json").read_bytes()).get("frames", [])
-    except (OSError, ValueError):
-        return folder
+    frames = transforms_of(folder).get("frames", [])
     names = {key: [frame[key] for frame in frames if key in frame] for key in ("file_path", "mask_path")}
-    if any(len({Path(name).name for name in of_kind}) < len(set(of_kind)) for of_kind in names.values()):
+    if not frames or any(len({Path(name).name for name in of_kind}) < len(set(of_kind)) for of_kind in names.values()):
         return folder
     mirror.mkdir(parents=True, exist_ok=True)
     for entry in folder.iterdir():
@@ -170,12 +169,12 @@ def write_smaller(folder: Path, mirror: Path, downscale: int | None) -> Path:
     return mirror
 
 
-def names_its_split(transforms: Path) -> bool:
-    """Whether a data set names its split. The data parser refuses files that cannot be read."""
-    try:
-        return any(f"{split}_filenames" in json.loads(transforms.read_bytes()) for split in ("train", "val", "test"))
-    except (OSError, ValueError, TypeError):
-        return False
+def transforms_of(folder: Path) -> dict[str, Any]:
+    """The content of transforms.json; empty where it cannot be read, which the data parser refuses."""
+    with contextlib.suppress(OSError, ValueError):
+        content = json.loads((folder / "transforms.json").read_bytes())
+        return content if isinstance(content, dict) else {}
+    return {}
 
 
 def mirror_with_split(folder: Path, model: str, mirror: Path) -> None:

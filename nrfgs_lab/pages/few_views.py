@@ -117,15 +117,9 @@ def floaters() -> str:
 
 
 def _run(one: Mapping) -> str:
-    """PSNR, SSIM and splats of one training, and its seconds if it was alone on its GPU."""
+    """PSNR, SSIM and splats of a training or in the mean, and its seconds if it was alone on its GPU."""
     seconds = f", {one['seconds']:.0f} s" if "seconds" in one else ""
     return f"{one['psnr']:.2f} dB, {one['ssim']:.3f}, {one['splats'] / 1000:.0f}k splats{seconds}"
-
-
-def summary(*place: str) -> str:
-    """PSNR, SSIM and splats of today's trainings of a capture and run, means over seeds."""
-    runs = today(*place)
-    return f"{mean(runs, 'psnr'):.2f} dB, {mean(runs, 'ssim'):.3f}, {mean(runs, 'splats') / 1000:.0f}k splats"
 
 
 def sparse_runs(scene: str) -> list[Trainings]:
@@ -168,7 +162,7 @@ BLOCKS = {
     "readme.demo": demo,
     "captures.rules_gain": rules_gain,
     "captures.floaters": floaters,
-    "captures.today": summary,
+    "captures.today": lambda *place: _run({of: mean(today(*place), of) for of in ("psnr", "ssim", "splats")}),
     "captures.sparse": sparse,
     "captures.by_views": by_views,
     "captures.one_host": lambda name: f"{one_host(name)['seconds']:.0f} s",

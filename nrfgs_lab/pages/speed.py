@@ -39,6 +39,4 @@ def scale_fit(column: str, factor: str, unit: str, renderer: str, most: str = "i
     return f"{parts[0]:.1f} {unit}, {parts[1]:.1f} for each million splats and {parts[2]:.2f} for each megapixel"
 
 
-BLOCKS = {
-    **{f"speed.{block.__name__}": block for block in (scale_fit, scale_ratios)},
-}
+BLOCKS = {"speed.scale_fit": scale_fit, "speed.scale_ratios": scale_ratios}

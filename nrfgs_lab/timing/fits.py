@@ -11,6 +11,7 @@ a process that may take 12 GB, CUDA's own part included. The difference of two n
 import gc
 import shlex
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,7 @@ import tyro
 from nrfgs_lab.bench.run import host_without_downloads
 from nrfgs_lab.bench.spec import QUIET
 from nrfgs_lab.timing.scale import Stopwatch, add_line, at_megapixels, lines_of, made, trained
-from nrfgs_lab.training_run import evaluate, machine, train
-from nrfgs_ns.training.guard import TrainingStopped
+from nrfgs_lab.training_run import evaluate, train
 
 KEY = "what", "method", "of"
 
@@ -46,14 +46,8 @@ class Fits:
         for cell in [*cells, *(("training", method, size) for size in self.gigabytes)]:
             if list(cell) in done:
                 continue
-            gc.collect()
-            torch.cuda.empty_cache()
-            record = {**dict(zip(KEY, cell, strict=True)), "machine": machine()}
-            try:
-                record |= self.parts(*cell[1:]) if cell[0] == "parts" else self.training(cell[2])
-            except (torch.OutOfMemoryError, TrainingStopped) as error:
-                record["failed"] = str(error).partition("\n")[0]
-            add_line(self.out, records, record)
+            measured = partial(self.parts, *cell[1:]) if cell[0] == "parts" else partial(self.training, cell[2])
+            add_line(self.out, records, dict(zip(KEY, cell, strict=True)), measured)
 
     def training(self, gigabytes: float) -> dict[str, Any]:
         """Cost and quality of a training in a process that may take so much."""

@@ -12,8 +12,7 @@ import shlex
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from time import perf_counter
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 import torch.distributed as dist
@@ -22,13 +21,14 @@ import tyro
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
 from nrfgs_lab.bench.spec import QUIET
-from nrfgs_lab.many_processes import free_port, join_group
+from nrfgs_lab.many_processes import join_group
+from nrfgs_lab.timing.scale import WARM, Stopwatch
 from nrfgs_lab.training_run import machine, parse, synchronize
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.model import initial_splats
 
 EXTENT = 2.0  # Side of the cube that the splats fill, in scene units; the cameras lie within [-1, 1].
-WARM, STEPS = 50, 200  # Steps before the clock starts, and on it.
+STEPS = 200  # On the clock.
 
 
 @dataclass
@@ -46,27 +46,27 @@ class Load:
         runs = []
         for world in self.devices:
             with tempfile.TemporaryDirectory() as folder:
-                url = f"tcp://127.0.0.1:{free_port()}"
-                mp.spawn(one_device, args=(self, world, url, folder), nprocs=world)
+                mp.spawn(one_device, args=(self, world, folder), nprocs=world)
                 parts = [json.loads(Path(folder, f"{rank}.json").read_text()) for rank in range(world)]
-            seconds = max(part["seconds"] for part in parts)
+            step_ms, peaks = max(ms for ms, _ in parts), [peak for _, peak in parts]
             run = {"options": self.options, "splats": self.splats, "devices": world, "steps": STEPS}
-            run |= {"images_per_second": world * STEPS / seconds, "step_ms": 1000 * seconds / STEPS}
-            runs.append({**run, "peak_memory_bytes": [part["peak_memory_bytes"] for part in parts]})
+            run |= {"images_per_second": 1000 * world / step_ms, "step_ms": step_ms, "peak_memory_bytes": peaks}
+            runs.append(run)
             print(runs[-1], flush=True)
         content = {"machine": machine(), "scene": self.scene.name, "runs": runs}
         write_whole(self.out, json.dumps(content, indent=1) + "\n")
 
 
-def one_device(rank: int, load: Load, world: int, url: str, folder: str) -> None:
-    """Train in one process of `Load`, and write FOLDER/RANK.json."""
+def one_device(rank: int, load: Load, world: int, folder: str) -> None:
+    """Train in one process of `Load`, and write FOLDER/RANK.json: milliseconds of a step, peak memory in bytes."""
     if world > 1:
-        join_group(rank, world, url, load.device_type)
+        join_group(rank, world, f"file://{folder}/meeting", load.device_type)
+    watch = Stopwatch(STEPS)
     options = {
         "--data": load.scene,
         "--output-dir": folder,
         "--machine.device-type": load.device_type,
-        "--max-num-iterations": WARM + STEPS + 1,
+        "--max-num-iterations": watch.steps,
         "--steps-per-save": 10**9,
         "--pipeline.model.random-init": True,
         "--pipeline.model.num-random": load.splats,
@@ -82,32 +82,19 @@ def one_device(rank: int, load: Load, world: int, url: str, folder: str) -> None
     initial_splats.mean_distance = lambda means: means.new_full((len(means), 1), EXTENT / load.splats ** (1 / 3))
     trainer = config.setup(local_rank=rank, world_size=world)
     trainer.setup()
-    measured: dict[str, Any] = {}
 
     def before(step: int) -> None:
-        if step == WARM:
-            together(world)
-            if torch.cuda.is_available():
-                torch.cuda.reset_peak_memory_stats()
-            measured["start"] = perf_counter()
-        if step == WARM + STEPS:
-            together(world)
-            measured["seconds"] = perf_counter() - measured.pop("start")
-            measured["peak_memory_bytes"] = torch.cuda.max_memory_allocated() if torch.cuda.is_available() else 0
-            Path(folder, f"{rank}.json").write_text(json.dumps(measured))
+        if world > 1 and step in (WARM, watch.end):
+            synchronize()
+            dist.barrier()
+        watch.before(step)
 
     trainer.callbacks.insert(0, TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], before))
     trainer.save_checkpoint = lambda step: None
     trainer.train()
+    Path(folder, f"{rank}.json").write_text(json.dumps([watch.step_ms, watch.peak_bytes]))
     if world > 1:
         dist.destroy_process_group()
-
-
-def together(world: int) -> None:
-    """Wait until all devices are idle."""
-    synchronize()
-    if world > 1:
-        dist.barrier()
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ import gc
 import json
 import math
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from importlib import import_module
@@ -38,6 +39,7 @@ from torch.profiler import ProfilerActivity, profile
 from nrfgs_lab.bench.measure import at_size, frames_per_second
 from nrfgs_lab.bench.run import host_without_downloads
 from nrfgs_lab.bench.spec import QUIET
+from nrfgs_lab.bench.table import grid
 from nrfgs_lab.training_run import machine, parse, synchronize
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.files import write_whole
@@ -275,15 +277,10 @@ class Scale:
                 continue
             capture = at_megapixels(resampled(self.config, count) if self.config else made(count), megapixels)
             for cell in cells:
-                gc.collect()
-                torch.cuda.empty_cache()
                 torch.manual_seed(0)
-                record = {**dict(zip(CELL, cell, strict=True)), "machine": machine()}
-                try:
-                    record |= self.measure(cell[2], capture, self.frames if megapixels == self.megapixels[0] else ())
-                except (torch.OutOfMemoryError, TrainingStopped) as error:
-                    record["failed"] = str(error).partition("\n")[0]
-                add_line(self.out, records, record)
+                sizes = self.frames if megapixels == self.megapixels[0] else ()
+                measured = partial(self.measure, cell[2], capture, sizes)
+                add_line(self.out, records, dict(zip(CELL, cell, strict=True)), measured)
 
     def measure(self, method: str, capture: Capture, sizes: tuple[str, ...]) -> dict[str, Any]:
         """Time and memory of a training's steps, and its frames per second at sizes of `FRAMES`."""
@@ -309,11 +306,17 @@ def lines_of(file: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
 
 
-def add_line(file: Path, records: list[dict[str, Any]], record: dict[str, Any]) -> None:
-    """Add a record to those in the file, and print it."""
-    records.append(record)
+def add_line(file: Path, records: list[dict], cell: dict[str, Any], measure: Callable[[], dict[str, Any]]) -> None:
+    """Measure a cell, add its record to those in the file, and print it; a training that stops leaves its reason."""
+    gc.collect()
+    torch.cuda.empty_cache()
+    records.append(cell | {"machine": machine()})
+    try:
+        records[-1] |= measure()
+    except (torch.OutOfMemoryError, TrainingStopped) as error:
+        records[-1]["failed"] = str(error).partition("\n")[0]
     write_whole(file, "".join(json.dumps(record) + "\n" for record in records))
-    print(record, flush=True)
+    print(records[-1], flush=True)
 
 
 def as_table(records: list[dict[str, Any]]) -> str:
@@ -321,14 +324,14 @@ def as_table(records: list[dict[str, Any]]) -> str:
     columns, groups = ("step_ms", "gpu_ms", "peak_mb", *FRAMES), {}
     for record in records:
         groups.setdefault(cell_of(record)[:3], []).append(record)
-    lines = [[*CELL[:3], *columns], ["---"] * (3 + len(columns))]
+    lines = []
     for (count, megapixels, method), same in sorted(groups.items(), key=lambda group: group[0][:2]):
         lines.append([f"{count:,}", f"{megapixels:g}", method])
         for column in columns:
             values = [record[column] for record in same if record.get(column)]
             text = f"{median(values):.4g} ({min(values):.4g} to {max(values):.4g})" if values else ""
             lines[-1].append(text or next((record["failed"] for record in same if "failed" in record), ""))
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return grid([*CELL[:3], *columns], lines)
 
 
 if __name__ == "__main__":
