@@ -63,11 +63,7 @@ def failed_views(pipeline) -> dict[str, dict[str, float]]:
 
 
 def main(config: tyro.conf.Positional[Path]) -> None:
-    """Print the PSNR of each test view with suspects left out.
-
-    Args:
-        config: config.yml of a training.
-    """
+    """Print the PSNR of each test view with suspects left out, from a training's config.yml."""
     views = failed_views(load_model(config, "test"))
     table = Table("view", *next(iter(views.values())), title="PSNR without splats that are ...")
     for name, row in views.items():

@@ -89,7 +89,7 @@ def listed(options: list[Option], prefix: str = "") -> str:
     """A Markdown list: flags without their common prefix, with their defaults, and what they are."""
     lines = [f"Below `--{prefix}`:\n"] if prefix else []
     for option in options:
-        lines.append(f"- **`{option.flag.removeprefix(prefix)} {_shown(option.default)}`** {linked(option.text)}")
+        lines.append(f"- **`{option.flag.removeprefix(prefix)} {option.default}`** {linked(option.text)}")
     return "\n".join(lines) + "\n"
 
 
@@ -98,23 +98,11 @@ def linked(text: str) -> str:
     return re.sub(r"docs/([\w-]+\.md)", r"[\1](\1)", text)
 
 
-def _shown(default: Any) -> str:
-    if default is dataclasses.MISSING:
-        return "required"
-    if default == "" or default == ():
-        return "none"
-    if isinstance(default, (tuple, list)):
-        return " ".join(map(str, default))
-    return default.as_posix() if isinstance(default, Path) else str(default)
-
-
 def methods() -> list[MethodSpecification]:
-    """The registered methods."""
     return [value for value in vars(method_config).values() if isinstance(value, MethodSpecification)]
 
 
 def page() -> str:
-    """The whole page."""
     first, *others = methods()
     options = [option for option in own_options(first.config) if option.flag not in LEFT_OUT]
     heads = [option for option in options if option.flag.startswith(APPEARANCE)]
@@ -144,7 +132,7 @@ def strategies() -> str:
     rows: dict[tuple[str, str], dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
     for name, config in STRATEGIES.items():
         for option in own_options(config()):
-            rows[option.flag.replace("-", "_"), option.text][_shown(option.default)].append(f"`{name}`")
+            rows[option.flag.replace("-", "_"), option.text][str(option.default)].append(f"`{name}`")
     lines = []
     for (flag, text), defaults in rows.items():
         cells = [

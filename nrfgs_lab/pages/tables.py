@@ -27,8 +27,7 @@ OPENING = "<!-- table "
 BLOCK = re.compile(r"<!-- table (\w+\.\w+)(\([^\n]*?\))? -->(.*?)<!-- end -->", re.DOTALL)
 BLOCKS = appendix.BLOCKS | few_views.BLOCKS | files.BLOCKS | methods.BLOCKS | others.BLOCKS | speed.BLOCKS
 SHEET = ROOT / "nrfgs_lab" / "pages" / "numbers.yaml"
-UNITS = {"k": 1e3, "M": 1e6, "G": 1e9}
-AGGREGATES: dict[str, Callable] = {"min": min, "max": max, "mean": fmean, "median": median, "sum": sum}
+AGGREGATES: dict[str, Callable] = {"min": min, "max": max, "mean": fmean, "median": median}
 OPERATORS = {"+": operator.add, "-": operator.sub, "*": operator.mul, "/": operator.truediv}
 FORMS: dict[str, Callable[[Any], str]] = {
     "signed": lambda number: signed(number, 2),
@@ -39,7 +38,6 @@ FORMS: dict[str, Callable[[Any], str]] = {
 
 
 def pages():
-    """The pages of this repository."""
     return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
@@ -70,7 +68,6 @@ def declared() -> dict[str, Any]:
 
 
 def rendered(block: Any) -> str:
-    """A block as Markdown."""
     if isinstance(block, str):
         return filled(block)
     body = []
@@ -124,11 +121,7 @@ def step(value: Any, key: str) -> Any:
 
 
 def formatted(value: Any, form: str) -> str:
-    """A value in a form."""
-    if form in FORMS:
-        return FORMS[form](value)
-    unit = UNITS.get(form[-1:])
-    return format(value / unit, form[:-1]) if unit else format(value, form)
+    return FORMS[form](value) if form in FORMS else format(value, form)
 
 
 def main(write: bool) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from .config import SceneConfig
 from .geometry import CAMERA, FIRST_SOLID, GROUND, SKY, Array, Box, Solid, Sphere, World, column, dot, normalize
 from .shading import Ambient, Finish, Lamp, fresnel, highlight, mean_fresnel, mirror_direction
-from .textures import Floor, Paint, Sky, Waves
+from .textures import Paint, Sky, Waves, checkered_floor
 
 BOUNCES = 2
 """Mirror reflections that are followed. After the last, a mirror shows the ambient light, as a rough surface would."""
@@ -36,7 +36,6 @@ class Scene:
     objects: tuple[Object, ...]
     lamps: tuple[Lamp, ...]
     ambient: Ambient
-    floor: Floor
     sky: Sky
     noises: tuple[Waves, ...]  # One noise for each surface: sky, ground, objects in order.
     floor_finish: Finish | None = None  # None: perfectly diffuse.
@@ -94,7 +93,7 @@ class Scene:
         for number in np.unique(surfaces):
             here = np.flatnonzero(surfaces == number)
             if number == GROUND:
-                finish, paint = self.floor_finish, self.floor(points[:, here], self.noises[GROUND])
+                finish, paint = self.floor_finish, checkered_floor(points[:, here], self.noises[GROUND])
             else:
                 item = self.objects[number - FIRST_SOLID]
                 finish, paint = item.finish, item.paint(item.solid.local(points[:, here]), self.noises[number])
@@ -214,7 +213,6 @@ def build_scene(config: SceneConfig) -> Scene:
         objects=tuple(replace(item, finish=SATIN) for item in objects) if config.studio else objects,
         lamps=studio_lamps() if config.studio else lamps,
         ambient=Ambient(below=(0.08, 0.07, 0.06), above=(0.17, 0.18, 0.26)),
-        floor=Floor(),
         floor_finish=SATIN if config.studio else None,
         sky=Sky(
             horizon=(0.56, 0.37, 0.27),

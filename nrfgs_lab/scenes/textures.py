@@ -85,25 +85,14 @@ class Paint:
         return darken(blend(self.low, self.high, 0.5 + 0.5 * pattern), noise(local), self.grain)
 
 
-@dataclass(frozen=True)
-class Floor:
-    """Checkered stone that fades to an even tone away from the centre."""
-
-    low: Colour = (0.07, 0.08, 0.11)
-    high: Colour = (0.80, 0.73, 0.63)
-    far: Colour = (0.46, 0.42, 0.40)
-    tile: float = 0.5  # Side of a tile, world units.
-    reach: float = 4.0  # Distance at which the pattern has faded to exp(-1) of its contrast, world units.
-    steepness: float = 4.0
-    grain: float = 0.35
-
-    def __call__(self, points: Array, noise: Waves) -> Array:
-        """Reflectance [3, N] at ground points [3, N]."""
-        x, y = points[0], points[1]
-        checker = soft_square_wave(x / self.tile, self.steepness) * soft_square_wave(y / self.tile, self.steepness)
-        near = darken(blend(self.low, self.high, 0.5 + 0.5 * checker), noise(points), self.grain)
-        far = column(self.far, points.dtype)
-        return far + (near - far) * np.exp(-(x * x + y * y) / self.reach**2)
+def checkered_floor(points: Array, noise: Waves) -> Array:
+    """Reflectance [3, N] at ground points [3, N]: tiles of half a world unit, which fade to an even tone away from the
+    centre, to exp(-1) of their contrast at 4 world units."""
+    x, y = points[0], points[1]
+    checker = soft_square_wave(x / 0.5, steepness=4.0) * soft_square_wave(y / 0.5, steepness=4.0)
+    stone = blend((0.07, 0.08, 0.11), (0.80, 0.73, 0.63), 0.5 + 0.5 * checker)
+    far = column((0.46, 0.42, 0.40), points.dtype)
+    return far + (darken(stone, noise(points), grain=0.35) - far) * np.exp(-(x * x + y * y) / 4.0**2)
 
 
 @dataclass(frozen=True)
