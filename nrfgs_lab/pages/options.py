@@ -30,7 +30,6 @@ INTRODUCTION = """# Options
 **These options, with `nrfgs`'s defaults, are this package's own; `ns-train nrfgs --help` lists all.** `nrfgs-sh`,
 `nrfgs-vdgs`, `nrfgs-gsnb` and `nrfgs-sg` have `view-noise`, `few-views`, `shrinkage`, `dense-start` and `near-plane`
 off, splatfacto's densification, and 30,000 steps without averaging. Cameras lie within [-1, 1] scene units.
-`python -m nrfgs_lab.pages.options` writes this page.
 """
 SPLATFACTOS = {field.name for field in dataclasses.fields(SplatfactoModelConfig)}
 """Options of splatfacto's model, not explained here."""
@@ -41,9 +40,7 @@ LEFT_OUT = (
     MODEL + "warmup-steps",
 )
 """Options that few need, or that another page explains: `--help` has them."""
-HOST = """`--data`, `--vis`, `--load-dir`, `--output-dir` and `--machine.seed` are nerfstudio's. `--help` lists learning
-rates, `--optimizers.NAME.optimizer.lr` to `.scheduler.lr-final`.
-"""
+HOST = "`--help` lists learning rates, `--optimizers.NAME.optimizer.lr` to `.scheduler.lr-final`.\n"
 
 
 class Option(NamedTuple):
