@@ -27,7 +27,7 @@ APPEARANCE = "pipeline.model.appearance."
 
 INTRODUCTION = """# Options
 
-**These options, with `nrfgs`'s defaults, are this package's own; `ns-train nrfgs --help` lists all.** `nrfgs-sh`,
+**These options, with `nrfgs`'s defaults, are this package's own; `ns-train METHOD --help` lists all.** `nrfgs-sh`,
 `nrfgs-vdgs`, `nrfgs-gsnb` and `nrfgs-sg` have `view-noise`, `few-views`, `shrinkage`, `dense-start` and `near-plane`
 off, splatfacto's densification, and 30,000 steps without averaging. Cameras lie within [-1, 1] scene units.
 """
@@ -119,7 +119,7 @@ def page() -> str:
         HOST,
         "## Methods\n",
         *(f"- `{one.config.method_name}`: {linked(one.description)}" for one in others),
-        "\n`ns-train METHOD --help` explains the options of its head, `nrfgs --help` lists the other commands.",
+        "\n`nrfgs --help` lists the other commands.",
     ]
     return "\n".join(parts) + "\n"
 
