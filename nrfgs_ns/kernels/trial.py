@@ -40,7 +40,7 @@ class Gate(dict[Hashable, Any]):
     """Outcomes of kernels' trials: each key is tried once, and a failure reported once.
 
     Args:
-        what: the subject of the warning "... runs in plain PyTorch".
+        what: the subject of the warning "... is slower".
     """
 
     def __init__(self, what: str):
@@ -65,7 +65,7 @@ class Gate(dict[Hashable, Any]):
         if key not in self:
             self[key] = _tried(trial)
             if isinstance(self[key], str) and not quiet:
-                logger.warning("%s runs in plain PyTorch on %s: %s.", self.what, device, self[key])
+                logger.warning("%s is slower on %s: %s.", self.what, device, self[key])
         return self[key]
 
     def opens(self, key: Hashable, device: torch.device, trial: Callable[[], object]) -> bool:

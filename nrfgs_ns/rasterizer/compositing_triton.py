@@ -1,28 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""gsplat's compositing and its gradients for one image of three channels, in two Triton kernels.
+"""gsplat's compositing and its gradients for one image of three channels, in two Triton kernels; gsplat is the oracle.
 
-gsplat's threads are pixels: what a pixel does to a splat's gradient is summed over a warp by shuffles, nine numbers for
-each splat. Here threads are splats, as in Mallick et al., Taming 3DGS (2024): a program composites some rows of a tile,
-and goes through the tile's list in batches of LANES x EACH splats. A thread has EACH consecutive splats and some
-columns of pixels, whose gradients it sums in registers. In return, what a pixel has passed is a scan over the lanes,
-but only of one number for EACH splats.
+gsplat's threads are pixels: what they add to a splat's gradient is summed over a warp by shuffles, nine numbers for
+each splat. Here threads are splats, as in the backward pass of Mallick et al., Taming 3DGS (2024). A program, of one
+warp, has a block of pixels and goes through its tile's list in batches of LANES x EACH splats. A thread has EACH
+consecutive splats and some columns of the block, and sums over their pixels in registers. In return, what is left of a
+pixel's light is a scan over the lanes, of one number for EACH splats.
 
-Splat k covers a pixel with alpha_k = min(0.999, o_k exp(-sigma_k)), counted as 0 below 1/255 or where sigma_k < 0, and
-the light behind it is T_k = T_{k-1} (1 - alpha_k), T_0 = 1. The first splat that would bring T_k to 1e-4 or below ends
-the pixel, and is not drawn itself: since T_k falls, those are drawn that leave T_k > 1e-4. Then
+Splat k covers a pixel with alpha_k = min(0.999, o_k exp(-sigma_k)), counted as 0 below 1/255 or where sigma_k < 0. The
+light behind it is T_k = T_{k-1} (1 - alpha_k), T_0 = 1. The first splat that would bring T_k to 1e-4 or below ends the
+pixel, and is not drawn itself: since T_k falls, those are drawn that leave T_k > 1e-4. Of n drawn splats
 
     C = sum_k w_k c_k + T_n b,    A = 1 - T_n = sum_k w_k,    w_k = alpha_k T_{k-1},    b the background.
 
-With g = dL/dC, h = dL/dA and s_k = w_k c_k . g,
+With g = dL/dC, h = dL/dA and s_k = w_k c_k . g, all that lies behind splat k adds R_k to the loss:
 
-    dL/dsigma_k = -s_k + alpha_k / (1 - alpha_k) R_k,    R_k = sum_{j > k} s_j + T_n (g . b - h) = g . C - h T_n - sum_{j <= k} s_j,
+    dL/dsigma_k = -w_k (c_k . g - R_k / T_k),
+    R_k = sum_{j > k} s_j + T_n (g . b - h) = g . C - h T_n - sum_{j <= k} s_j,
 
-so that the backward pass also goes front to back. R_k is a difference: it is off by some rounding units of sum |s_j|,
-and so is dL/dsigma_k, times alpha_k / (1 - alpha_k). gsplat goes back to front, from a T_n that has been rounded as
-1 - A, so that its T_k are off by up to 1e-7 / T_n of themselves.
+so that the backward pass goes front to back too. As a difference R_k is off by some rounding units of sum_j |s_j|,
+which counts where little light is left. gsplat goes back to front from a T_n that has been rounded as 1 - A: its w_k
+are off by a rounding unit / T_n of themselves.
 
-Pixels of a column share dx, their distance from a splat's centre along x, and pixels of a row dy. So gradients of
-centres and conics need three sums over a column, of v = dL/dsigma, v dy and v dy^2.
+Pixels of a column have the same distance dx from a splat's centre, pixels of a row the same dy. So gradients of centres
+and conics are sums over columns of three numbers: v = -dL/dsigma, v dy and v dy^2.
 """
 
 import torch
@@ -33,17 +34,12 @@ from torch.autograd.function import once_differentiable
 
 from nrfgs_ns.kernels.launch import Launcher
 
-LANES = 8
+BLOCK = tl.constexpr(8)
+"""Side of a program's pixels, which divides a tile's."""
+LANES = tl.constexpr(8)
 """Threads of a warp along the list; a power of two."""
-EACH = 4
+EACH = tl.constexpr(4)
 """Splats of a thread."""
-ROWS = 8
-"""Most rows of pixels of a program."""
-
-PACKED = True
-STEP = 1
-WARPS = 1
-MAXNREG_F = MAXNREG_B = None
 
 LOG2_E = tl.constexpr(1.4426950408889634)
 LN_2 = tl.constexpr(0.6931471805599453)
@@ -53,36 +49,19 @@ MIN_TRANSMITTANCE = tl.constexpr(1e-4)
 
 
 @triton.jit
-def _multiply(a, b):
-    return a * b
+def _rows(table, rows, valid, SIZE: tl.constexpr):
+    """Columns of some rows of a table [.., SIZE]."""
+    columns = ()
+    for i in tl.static_range(SIZE):
+        columns += (tl.load(table + rows * SIZE + i, mask=valid, other=0.0),)
+    return columns
 
 
 @triton.jit
-def _plus(a, b):
-    return a + b
-
-
-@triton.jit
-def _batch(ids, at, end, x, means2d, conics, opacities, colors, LANES: tl.constexpr, EACH: tl.constexpr):
-    """The splats of a batch: EACH times rows, x's distances [X, LANES], then -log2(e) times the terms of sigma: xx / 2
-    at these distances, xy, yy / 2; centre's y, log2 of the opacity, colours."""
-    splats = ()
-    for k in tl.static_range(EACH):
-        place = at + tl.arange(0, LANES) * EACH + k
-        valid = place < end
-        splat = tl.load(ids + place, mask=valid, other=0)
-        dx = tl.load(means2d + splat * 2, mask=valid, other=0.0)[None, :] - x[:, None]
-        y = tl.load(means2d + splat * 2 + 1, mask=valid, other=0.0)
-        a = tl.load(conics + splat * 3, mask=valid, other=0.0) * (-0.5 * LOG2_E)
-        b = tl.load(conics + splat * 3 + 1, mask=valid, other=0.0) * -LOG2_E
-        c = tl.load(conics + splat * 3 + 2, mask=valid, other=0.0) * (-0.5 * LOG2_E)
-        opacity = tl.load(opacities + splat, mask=valid, other=0.0)
-        peak = tl.where(opacity <= 0.0, -float("inf"), tl.log2(opacity))
-        red = tl.load(colors + splat * 3, mask=valid, other=0.0)
-        green = tl.load(colors + splat * 3 + 1, mask=valid, other=0.0)
-        blue = tl.load(colors + splat * 3 + 2, mask=valid, other=0.0)
-        splats += ((splat, dx, a[None, :] * dx * dx, a, b, c, y, peak, red, green, blue),)
-    return splats
+def _add(table, rows, valid, columns, SIZE: tl.constexpr):
+    """Add to some rows of a table [.., SIZE]."""
+    for i in tl.static_range(SIZE):
+        tl.atomic_add(table + rows * SIZE + i, columns[i], mask=valid, sem="relaxed")
 
 
 @triton.jit
@@ -92,257 +71,206 @@ def _lane(values, lane):
 
 
 @triton.jit
-def _blend(splats, y, start, LANES: tl.constexpr, EACH: tl.constexpr):
-    """A batch at a row of pixels that `start` is left for: o exp(-sigma) and alpha of each splat, where 0 stands for
-    what is not drawn; T in front of a thread's splats and behind each of them, and T behind the batch. All [X, LANES].
+def _block(side, columns):
+    """This program's number and its tile's; columns and first row of its pixels."""
+    column, row = tl.program_id(0) * BLOCK, tl.program_id(1) * BLOCK
+    program = tl.program_id(1) * tl.num_programs(0) + tl.program_id(0)
+    return program, row // side * columns + column // side, column + tl.arange(0, BLOCK), row
+
+
+@triton.jit
+def _pixels(row, column, width, height):
+    """A row of pixels: their numbers, and which of them the image has."""
+    return row * width + column, column < tl.where(row < height, width, 0)
+
+
+@triton.jit
+def _batch(ids, at, end, column, means2d, conics, opacities, colors):
+    """A batch of a list, EACH times: splats; distances along x [X, LANES]; -log2(e) times sigma's terms xx / 2 at these
+    distances, xx / 2, xy and yy / 2; y of the centre; log2 of the opacity; colours."""
+    splats = ()
+    for k in tl.static_range(EACH):
+        place = at + tl.arange(0, LANES) * EACH + k
+        valid = place < end
+        splat = tl.load(ids + place, mask=valid, other=0)
+        x, y = _rows(means2d, splat, valid, 2)
+        a, b, c = _rows(conics, splat, valid, 3)
+        a, b, c = a * (-0.5 * LOG2_E), b * -LOG2_E, c * (-0.5 * LOG2_E)
+        dx = x[None, :] - (column.to(tl.float32) + 0.5)[:, None]
+        opacity = tl.load(opacities + splat, mask=valid, other=0.0)
+        peak = tl.where(opacity <= 0.0, -float("inf"), tl.log2(opacity))
+        splats += ((splat, dx, a[None, :] * dx * dx, a, b, c, y, peak, _rows(colors, splat, valid, 3)),)
+    return splats
+
+
+@triton.jit
+def _blend(splats, row, left):
+    """A batch at a row of pixels that have T = `left` in front of it: EACH times o exp(-sigma), alpha (0: not drawn), T
+    in front of the splat and T behind it; then T behind the batch. All [X, LANES].
 
     Sums of products are spelt out, so that both kernels draw the same splats."""
     shown, alphas, passed = (), (), ()
     for k in tl.static_range(EACH):
-        _, dx, along_x, _, b, c, center, peak, _, _, _ = splats[k]
-        dy = center - y
+        _, dx, along_x, _, b, c, y, peak, _ = splats[k]
+        dy = y - (row.to(tl.float32) + 0.5)
         power = tl.fma(dx, (b * dy)[None, :], along_x + tl.fma(c * dy, dy, peak)[None, :])
         value = tl.exp2(power)
         alpha = tl.minimum(value, MAX_ALPHA)
         alpha = tl.where((power > peak[None, :]) | (alpha < MIN_ALPHA), 0.0, alpha)
-        passes = 1.0 - alpha
-        if k > 0:
-            passes *= passed[k - 1]
+        passes = (1.0 - alpha) if k == 0 else passed[k - 1] * (1.0 - alpha)
         shown, alphas, passed = shown + (value,), alphas + (alpha,), passed + (passes,)
-    scan = tl.associative_scan(passed[EACH - 1], 1, _multiply)
+    scan = tl.cumprod(passed[EACH - 1], 1)
     lane = tl.arange(0, LANES)[None, :]
-    front = start * tl.where(lane == 0, 1.0, _lane(scan, tl.maximum(lane - 1, 0)))
-    drawn, behind = (), ()
+    front = left * tl.where(lane == 0, 1.0, _lane(scan, tl.maximum(lane - 1, 0)))
+    drawn, before, behind = (), (), ()
     for k in tl.static_range(EACH):
-        left = front * passed[k]
-        drawn, behind = drawn + (tl.where(left > MIN_TRANSMITTANCE, alphas[k], 0.0),), behind + (left,)
-    return shown, drawn, front, behind, start * _lane(scan, LANES - 1)
+        before += (front if k == 0 else behind[k - 1],)
+        behind += (front * passed[k],)
+        drawn += (tl.where(behind[k] > MIN_TRANSMITTANCE, alphas[k], 0.0),)
+    return shown, drawn, before, behind, left * _lane(scan, LANES - 1)
 
 
-@triton.jit(do_not_specialize=["width", "height", "columns"])
+@triton.jit(do_not_specialize=["width", "height", "side", "columns"])
 def forward_kernel(
-    begins, ids, means2d, conics, opacities, colors, background, render, alphas, ends,
-    width, height, columns,
-    SIDE: tl.constexpr, ROWS: tl.constexpr, LANES: tl.constexpr, EACH: tl.constexpr,
-):  # fmt: skip
-    """Image [height, width, 3] over a background, alphas [height, width], and how far each program has gone in its
-    tile's list."""
-    program = tl.program_id(0)
-    tile = program // (SIDE // ROWS)
-    column = tile % columns * SIDE + tl.arange(0, SIDE)
-    top = tile // columns * SIDE + program % (SIDE // ROWS) * ROWS
-    x = column.to(tl.float32) + 0.5
-    left, red, green, blue, covered = (), (), (), (), ()
-    none = tl.zeros((SIDE, LANES), tl.float32)
-    for row in tl.static_range(ROWS):
-        left += (tl.where(column < tl.where(top + row < height, width, 0), 1.0, 0.0)[:, None] + none,)
-        red, green, blue, covered = red + (none,), green + (none,), blue + (none,), covered + (none,)
+    begins, ids, means2d, conics, opacities, colors, background, render, alphas, ends, width, height, side, columns
+):
+    """Image [height, width, 3] over a background, A [height, width], and where each program has ended in its list."""
+    program, tile, column, top = _block(side, columns)
+    none = tl.zeros((BLOCK, LANES), tl.float32)
+    rows = ()
+    for row in tl.static_range(BLOCK):
+        pixel, inside = _pixels(top + row, column, width, height)
+        rows += ((tl.where(inside, 1.0, 0.0)[:, None] + none, none, none, none, none),)
     at, end, live = tl.load(begins + tile), tl.load(begins + tile + 1), 1
     while (at < end) & (live > 0):
-        splats = _batch(ids, at, end, x, means2d, conics, opacities, colors, LANES, EACH)
-        new_left, new_red, new_green, new_blue, new_covered = (), (), (), (), ()
-        for row in tl.static_range(ROWS):
-            y = (top + row).to(tl.float32) + 0.5
-            _, drawn, before, behind, last = _blend(splats, y, left[row], LANES, EACH)
-            r, g, b, all = red[row], green[row], blue[row], covered[row]
+        splats = _batch(ids, at, end, column, means2d, conics, opacities, colors)
+        new_rows, most_left = (), none
+        for row in tl.static_range(BLOCK):
+            left, red, green, blue, covered = rows[row]
+            _, drawn, before, _, left = _blend(splats, top + row, left)
             for k in tl.static_range(EACH):
-                weight = drawn[k] * (before if k == 0 else behind[k - 1])
-                r = tl.fma(weight, splats[k][8][None, :], r)
-                g = tl.fma(weight, splats[k][9][None, :], g)
-                b = tl.fma(weight, splats[k][10][None, :], b)
-                all += weight
-            new_left, new_covered = new_left + (last,), new_covered + (all,)
-            new_red, new_green, new_blue = new_red + (r,), new_green + (g,), new_blue + (b,)
-        left, red, green, blue, covered = new_left, new_red, new_green, new_blue, new_covered
+                weight, color = drawn[k] * before[k], splats[k][8]
+                red = tl.fma(weight, color[0][None, :], red)
+                green = tl.fma(weight, color[1][None, :], green)
+                blue = tl.fma(weight, color[2][None, :], blue)
+                covered += weight
+            new_rows, most_left = new_rows + ((left, red, green, blue, covered),), tl.maximum(most_left, left)
+        rows = new_rows
         at += LANES * EACH
-        brightest = left[0]
-        for row in tl.static_range(1, ROWS):
-            brightest = tl.maximum(brightest, left[row])
         # As an integer, of the whole warp: one instruction, after which the compiler knows that threads stay together.
-        live = tl.max((brightest > MIN_TRANSMITTANCE).to(tl.int32))
+        live = tl.max((most_left > MIN_TRANSMITTANCE).to(tl.int32))
     tl.store(ends + program, tl.minimum(at, end))
-    for row in tl.static_range(ROWS):
-        pixel = (top + row) * width + column
-        inside = column < tl.where(top + row < height, width, 0)
-        alpha = tl.sum(covered[row], axis=1)
-        behind = 1.0 - alpha
+    for row in tl.static_range(BLOCK):
+        pixel, inside = _pixels(top + row, column, width, height)
+        alpha = tl.sum(rows[row][4], axis=1)
         tl.store(alphas + pixel, alpha, mask=inside)
-        r, g, b = tl.sum(red[row], axis=1), tl.sum(green[row], axis=1), tl.sum(blue[row], axis=1)
-        tl.store(render + pixel * 3, tl.fma(behind, tl.load(background), r), mask=inside)
-        tl.store(render + pixel * 3 + 1, tl.fma(behind, tl.load(background + 1), g), mask=inside)
-        tl.store(render + pixel * 3 + 2, tl.fma(behind, tl.load(background + 2), b), mask=inside)
+        for channel in tl.static_range(3):
+            color = tl.fma(1.0 - alpha, tl.load(background + channel), tl.sum(rows[row][1 + channel], axis=1))
+            tl.store(render + pixel * 3 + channel, color, mask=inside)
 
 
-@triton.jit
-def _add(where, some, value):
-    tl.atomic_add(where, value, mask=some, sem="relaxed")
-
-
-@triton.jit
-def _add_four(where, some, a, b, c, d):
-    """Add to four numbers in a row at once."""
-    four = tl.reshape(tl.join(tl.join(a, c), tl.join(b, d)), (a.shape[0], 4))
-    tl.atomic_add(where[:, None] + tl.arange(0, 4)[None, :], four, mask=some[:, None], sem="relaxed")
-
-
-@triton.jit(do_not_specialize=["width", "height", "columns"])
+@triton.jit(do_not_specialize=["width", "height", "side", "columns"])
 def backward_kernel(
     begins, ids, means2d, conics, opacities, colors, render, alphas, ends, d_render, d_alphas,
-    d_means2d, d_conics, d_opacities, d_colors, d_means2d_abs, gradients,
-    width, height, columns,
-    SIDE: tl.constexpr, ROWS: tl.constexpr, LANES: tl.constexpr, EACH: tl.constexpr, ABSGRAD: tl.constexpr,
-    PACKED: tl.constexpr, STEP: tl.constexpr,
+    d_means2d, d_conics, d_opacities, d_colors, absgrad, width, height, side, columns, ABSGRAD: tl.constexpr,
 ):  # fmt: skip
     """Add the gradients of the forward pass's tables to tables of zeros, from its results and their gradients."""
-    program = tl.program_id(0)
-    tile = program // (SIDE // ROWS)
-    column = tile % columns * SIDE + tl.arange(0, SIDE)
-    top = tile // columns * SIDE + program % (SIDE // ROWS) * ROWS
-    x = column.to(tl.float32) + 0.5
-    none = tl.zeros((SIDE, LANES), tl.float32)
-    left, worth = (), ()
-    for step in tl.static_range(ROWS):
-        pixel = (top + step) * width + column
-        inside = column < tl.where(top + step < height, width, 0)
-        value = tl.load(d_alphas + pixel, mask=inside, other=0.0)
-        value *= tl.load(alphas + pixel, mask=inside, other=0.0) - 1.0
+    program, tile, column, top = _block(side, columns)
+    none = tl.zeros((BLOCK, LANES), tl.float32)
+    left, worth = (), ()  # T and R of the block's rows, the next one's first
+    for step in tl.static_range(BLOCK):
+        pixel, inside = _pixels(top + step, column, width, height)
+        upstream, rgb = _rows(d_render, pixel, inside, 3), _rows(render, pixel, inside, 3)
+        light = tl.load(alphas + pixel, mask=inside, other=0.0) - 1.0
+        value = tl.load(d_alphas + pixel, mask=inside, other=0.0) * light
         for channel in tl.static_range(3):
-            upstream = tl.load(d_render + pixel * 3 + channel, mask=inside, other=0.0)
-            value = tl.fma(upstream, tl.load(render + pixel * 3 + channel, mask=inside, other=0.0), value)
-        left += (tl.where(inside, 1.0, 0.0)[:, None] + none,)
-        worth += (value[:, None] + none,)
+            value = tl.fma(upstream[channel], rgb[channel], value)
+        left, worth = left + (tl.where(inside, 1.0, 0.0)[:, None] + none,), worth + (value[:, None] + none,)
     end = tl.load(begins + tile + 1)
     for at in range(tl.load(begins + tile), tl.load(ends + program), LANES * EACH):
-        splats = _batch(ids, at, end, x, means2d, conics, opacities, colors, LANES, EACH)
+        splats = _batch(ids, at, end, column, means2d, conics, opacities, colors)
         sums = ()
-        for k in tl.static_range(EACH):
+        for _k in tl.static_range(EACH):
             sums += ((none, none, none, none, none, none, none, none),)
-        for row in range(0, ROWS, STEP):
-            for step in tl.static_range(STEP):
-                y = (top + row + step).to(tl.float32) + 0.5
-                here = d_render + ((top + row + step) * width + column) * 3
-                inside = column < tl.where(top + row + step < height, width, 0)
-                red = tl.load(here, mask=inside, other=0.0)[:, None]
-                green = tl.load(here + 1, mask=inside, other=0.0)[:, None]
-                blue = tl.load(here + 2, mask=inside, other=0.0)[:, None]
-                shown, drawn, before, behind, last = _blend(splats, y, left[step], LANES, EACH)
-                weights, gains, total, left_over = (), (), none, before
-                for k in tl.static_range(EACH):
-                    weight = drawn[k] * (before if k == 0 else behind[k - 1])
-                    gain = tl.fma(blue, splats[k][10][None, :], green * splats[k][9][None, :])
-                    gain = tl.fma(red, splats[k][8][None, :], gain)
-                    total = tl.fma(weight, gain, total)
-                    left_over = tl.where(behind[k] > MIN_TRANSMITTANCE, behind[k], left_over)
-                    weights, gains = weights + (weight,), gains + (gain,)
-                scan = tl.associative_scan(total, 1, _plus)
-                left, worth = left + (last,), worth + (worth[step] - _lane(scan, LANES - 1),)
-                mean = (worth[step] - scan) / tl.maximum(left_over, MIN_TRANSMITTANCE)
-                new_sums = ()
-                for k in tl.static_range(EACH - 1, -1, -1):
-                    _, dx, _, a, b, c, center, _, _, _, _ = splats[k]
-                    by_0, by_y, by_yy, by_red, by_green, by_blue, abs_x, abs_y = sums[k]
-                    more = gains[k] - mean
-                    mean = tl.fma(drawn[k], more, mean)
-                    v = tl.where(shown[k] <= MAX_ALPHA, weights[k] * more, 0.0)
-                    dy = center - y
-                    by_0 += v
-                    by_y = tl.fma(v, dy[None, :], by_y)
-                    by_yy = tl.fma(v, (dy * dy)[None, :], by_yy)
-                    by_red = tl.fma(weights[k], red, by_red)
-                    by_green = tl.fma(weights[k], green, by_green)
-                    by_blue = tl.fma(weights[k], blue, by_blue)
-                    if ABSGRAD:
-                        abs_x = tl.fma(tl.abs(v), tl.abs(tl.fma(2.0 * a[None, :], dx, (b * dy)[None, :])), abs_x)
-                        abs_y = tl.fma(tl.abs(v), tl.abs(tl.fma(b[None, :], dx, (2.0 * c * dy)[None, :])), abs_y)
-                    new_sums = ((by_0, by_y, by_yy, by_red, by_green, by_blue, abs_x, abs_y),) + new_sums
-                sums = new_sums
-            left, worth = left[STEP:], worth[STEP:]  # the next rows' come first
-        for k in tl.static_range(EACH):
-            splat, dx, _, a, b, c, _, _, _, _, _ = splats[k]
-            by_0, by_y, by_yy, by_red, by_green, by_blue, abs_x, abs_y = sums[k]
-            by_x = by_0 * dx
-            by_xx, by_xy, by_yy = tl.sum(by_x * dx, axis=0), tl.sum(by_y * dx, axis=0), tl.sum(by_yy, axis=0)
-            by_x, by_y, by_0 = tl.sum(by_x, axis=0) * LN_2, tl.sum(by_y, axis=0) * LN_2, tl.sum(by_0, axis=0)
-            by_red, by_green, by_blue = tl.sum(by_red, axis=0), tl.sum(by_green, axis=0), tl.sum(by_blue, axis=0)
-            some = (by_0 != 0.0) | (by_red != 0.0) | (by_green != 0.0) | (by_blue != 0.0)
-            by_0 /= tl.load(opacities + splat, mask=some, other=1.0)
-            if ABSGRAD:
-                abs_x, abs_y = tl.sum(abs_x, axis=0) * LN_2, tl.sum(abs_y, axis=0) * LN_2
-            else:
-                abs_x, abs_y = by_0, by_0
-            mean_x, mean_y = 2.0 * a * by_x + b * by_y, b * by_x + 2.0 * c * by_y
-            if PACKED:
-                _add_four(gradients + splat * 12, some, by_red, by_green, by_blue, by_0)
-                _add_four(gradients + splat * 12 + 4, some, mean_x, mean_y, abs_x, abs_y)
-                _add_four(gradients + splat * 12 + 8, some, -0.5 * by_xx, -by_xy, -0.5 * by_yy, by_0)
-            else:
-                _add(d_colors + splat * 3, some, by_red)
-                _add(d_colors + splat * 3 + 1, some, by_green)
-                _add(d_colors + splat * 3 + 2, some, by_blue)
-                _add(d_opacities + splat, some, by_0)
-                _add(d_means2d + splat * 2, some, mean_x)
-                _add(d_means2d + splat * 2 + 1, some, mean_y)
-                _add(d_conics + splat * 3, some, -0.5 * by_xx)
-                _add(d_conics + splat * 3 + 1, some, -by_xy)
-                _add(d_conics + splat * 3 + 2, some, -0.5 * by_yy)
+        for row in range(BLOCK):
+            pixel, inside = _pixels(top + row, column, width, height)
+            red, green, blue = _rows(d_render, pixel, inside, 3)
+            red, green, blue = red[:, None], green[:, None], blue[:, None]
+            shown, drawn, before, behind, new_left = _blend(splats, top + row, left[0])
+            weights, gains, total, last = (), (), none, before[0]  # last: T behind the thread's last drawn splat
+            for k in tl.static_range(EACH):
+                color = splats[k][8]
+                gain = tl.fma(blue, color[2][None, :], green * color[1][None, :])
+                gains += (tl.fma(red, color[0][None, :], gain),)
+                weights += (drawn[k] * before[k],)
+                total = tl.fma(weights[k], gains[k], total)
+                last = tl.where(behind[k] > MIN_TRANSMITTANCE, behind[k], last)
+            scan = tl.cumsum(total, 1)
+            mean = (worth[0] - scan) / tl.maximum(last, MIN_TRANSMITTANCE)  # R_k / T_k
+            left, worth = left[1:] + (new_left,), worth[1:] + (worth[0] - _lane(scan, LANES - 1),)
+            new_sums = ()
+            for k in tl.static_range(EACH - 1, -1, -1):
+                _, dx, _, a, b, c, y, _, _ = splats[k]
+                by_0, by_y, by_yy, by_red, by_green, by_blue, abs_x, abs_y = sums[k]
+                more = gains[k] - mean
+                mean = tl.fma(drawn[k], more, mean)
+                v = tl.where(shown[k] <= MAX_ALPHA, weights[k] * more, 0.0)
+                dy = y - ((top + row).to(tl.float32) + 0.5)
+                by_0, by_y, by_yy = by_0 + v, tl.fma(v, dy[None, :], by_y), tl.fma(v, (dy * dy)[None, :], by_yy)
+                by_red, by_green = tl.fma(weights[k], red, by_red), tl.fma(weights[k], green, by_green)
+                by_blue = tl.fma(weights[k], blue, by_blue)
                 if ABSGRAD:
-                    _add(d_means2d_abs + splat * 2, some, abs_x)
-                    _add(d_means2d_abs + splat * 2 + 1, some, abs_y)
+                    abs_x = tl.fma(tl.abs(v), tl.abs(tl.fma(2.0 * a[None, :], dx, (b * dy)[None, :])), abs_x)
+                    abs_y = tl.fma(tl.abs(v), tl.abs(tl.fma(b[None, :], dx, (2.0 * c * dy)[None, :])), abs_y)
+                new_sums = ((by_0, by_y, by_yy, by_red, by_green, by_blue, abs_x, abs_y),) + new_sums
+            sums = new_sums
+        for k in tl.static_range(EACH):
+            splat, dx, _, a, b, c, _, _, _ = splats[k]
+            v, by_y, by_yy, by_red, by_green, by_blue, abs_x, abs_y = sums[k]
+            by_0, by_x, by_xx = tl.sum(v, axis=0), tl.sum(v * dx, axis=0) * LN_2, tl.sum(v * dx * dx, axis=0)
+            by_xy, by_y, by_yy = tl.sum(by_y * dx, axis=0), tl.sum(by_y, axis=0) * LN_2, tl.sum(by_yy, axis=0)
+            color = tl.sum(by_red, axis=0), tl.sum(by_green, axis=0), tl.sum(by_blue, axis=0)
+            some = (by_0 != 0.0) | (color[0] != 0.0) | (color[1] != 0.0) | (color[2] != 0.0)
+            _add(d_colors, splat, some, color, 3)
+            _add(d_opacities, splat, some, (by_0 / tl.load(opacities + splat, mask=some, other=1.0),), 1)
+            _add(d_means2d, splat, some, (2.0 * a * by_x + b * by_y, b * by_x + 2.0 * c * by_y), 2)
+            _add(d_conics, splat, some, (-0.5 * by_xx, -by_xy, -0.5 * by_yy), 3)
+            if ABSGRAD:
+                _add(absgrad, splat, some, (tl.sum(abs_x, axis=0) * LN_2, tl.sum(abs_y, axis=0) * LN_2), 2)
 
 
 launch_forward, launch_backward = Launcher(forward_kernel), Launcher(backward_kernel)
 
 
-class Composite(torch.autograd.Function):
-    """(means2d, conics, opacities, colors) -> (render [1, H, W, 3], alphas [1, H, W, 1]); all tensors contiguous."""
+class CompositeSplats(torch.autograd.Function):
+    """(means2d, conics, opacities, colors, background [1, 3]) -> (render [1, H, W, 3], alphas [1, H, W, 1]).
+
+    All tensors are contiguous; `begins` and `ids` are `tile_lists`'s, `shape` is width, height and the tiles' side in
+    pixels. With `absgrad` the backward pass leaves sum |dL/dmean2d| over pixels in `means2d.absgrad`.
+    """
 
     @staticmethod
-    def forward(ctx, means2d, conics, opacities, colors, background, begins, ids, sizes: tuple, absgrad: bool):
+    def forward(ctx, means2d, conics, opacities, colors, background, begins, ids, shape: tuple, absgrad: bool):
+        width, height, _ = shape
+        ctx.absgrad, ctx.numbers = absgrad, (*shape, begins.shape[2])
+        ctx.grid = (-(-width // BLOCK.value), -(-height // BLOCK.value), 1)
+        render, alphas = means2d.new_empty(1, height, width, 3), means2d.new_empty(1, height, width, 1)
         tables = begins, ids, means2d, conics, opacities, colors
-        render, alphas, ends = composite(*tables, background, *sizes)
-        ctx.save_for_backward(*tables, render, alphas, ends)
-        ctx.sizes, ctx.absgrad = sizes, absgrad
+        results = render, alphas, ids.new_empty(ctx.grid[0] * ctx.grid[1])
+        launch_forward(ctx.grid, *tables, background, *results, *ctx.numbers, num_warps=1)
+        ctx.save_for_backward(*tables, *results)
         return render, alphas
 
     @staticmethod
     @once_differentiable
     def backward(ctx, d_render: Tensor, d_alphas: Tensor):
+        _, _, *tables, _, alphas, _ = saved = ctx.saved_tensors
+        gradients = [torch.zeros_like(table) for table in tables]
+        absgrad = torch.zeros_like(tables[0]) if ctx.absgrad else alphas
         upstream = d_render.contiguous(), d_alphas.contiguous()
-        *gradients, absolute = gradients_of(*ctx.saved_tensors, *upstream, *ctx.sizes, ctx.absgrad)
+        arguments = *saved, *upstream, *gradients, absgrad, *ctx.numbers
+        launch_backward(ctx.grid, *arguments, ABSGRAD=ctx.absgrad, num_warps=1)
         if ctx.absgrad:
-            ctx.saved_tensors[2].absgrad = absolute
-        return *gradients, None, None, None, None, None
-
-
-def composite(begins, ids, means2d, conics, opacities, colors, background, width: int, height: int, side: int):
-    """Image, alphas, and how far each program has gone in its tile's list."""
-    rows, columns = begins.shape[1] - 1, begins.shape[2]
-    part = min(ROWS, side)
-    grid = (columns * rows * (side // part), 1, 1)
-    render, alphas = means2d.new_empty(1, height, width, 3), means2d.new_empty(1, height, width, 1)
-    ends = torch.empty(grid[0], dtype=torch.int32, device=means2d.device)
-    launch_forward(
-        grid, begins, ids, means2d, conics, opacities, colors, background, render, alphas, ends, width, height, columns,
-        SIDE=side, ROWS=part, LANES=LANES, EACH=EACH, num_warps=WARPS, maxnreg=MAXNREG_F,
-    )  # fmt: skip
-    return render, alphas, ends
-
-
-def gradients_of(
-    begins, ids, means2d, conics, opacities, colors, render, alphas, ends, d_render, d_alphas,
-    width: int, height: int, side: int, absgrad: bool,
-):  # fmt: skip
-    """Gradients of means2d, conics, opacities, colors; absgrad or None."""
-    packed = means2d.new_zeros(len(means2d), 12) if PACKED else means2d
-    gradients = [None if PACKED else torch.zeros_like(table) for table in (means2d, conics, opacities, colors)]
-    absolute = torch.zeros_like(means2d) if absgrad and not PACKED else means2d
-    launch_backward(
-        (len(ends), 1, 1), begins, ids, means2d, conics, opacities, colors, render, alphas, ends, d_render, d_alphas,
-        *(means2d if table is None else table for table in gradients), absolute, packed, width, height, begins.shape[2],
-        SIDE=side, ROWS=min(ROWS, side), LANES=LANES, EACH=EACH, ABSGRAD=absgrad, PACKED=PACKED, STEP=STEP,
-        num_warps=WARPS, maxnreg=MAXNREG_B,
-    )  # fmt: skip
-    if PACKED:
-        gradients = [part.contiguous() for part in (packed[:, 4:6], packed[:, 8:11], packed[:, 3], packed[:, :3])]
-        absolute = packed[:, 6:8].contiguous() if absgrad else None
-    return *gradients, absolute
+            tables[0].absgrad = absgrad
+        background = ((1.0 - alphas) * d_render).sum((1, 2)) if ctx.needs_input_grad[4] else None
+        return *gradients, background, None, None, None, None

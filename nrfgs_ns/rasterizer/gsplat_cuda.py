@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The CUDA back end: gsplat's kernels, called stage by stage as its packed rasterization calls them.
+"""The CUDA back end: gsplat's kernels, called stage by stage as its packed rasterization calls them, and ours for what
+training needs most: `tile_lists.py`, `compositing_triton.py`.
 
 The differences between gsplat 1.4.0 and 1.5.3 stay in this file. 1.5.3 has batches; bounds a splat by a rectangle of
 3.33 standard deviations along each axis of the image, where 1.4.0 has a square of 3 along the longest one; names
@@ -40,6 +41,7 @@ def load_kernels(device: torch.device) -> None:
     """Load all of gsplat's kernels, by calling one, and try ours."""
     spherical_harmonics(0, torch.ones(1, 3, device=device), torch.ones(1, 1, 3, device=device))
     _kernels_run_on(device)
+    _compositing_runs_on(device)
 
 
 def project(geometry: tuple[Tensor, ...], cameras: tuple, options: ProjectionOptions) -> Projection:
@@ -130,25 +132,46 @@ def composite(
     Args:
         leave_out: do not draw rows that are not finite; only if `leaves_out` allows it.
     """
-    behind = backgrounds
-    if HAS_BATCHES and behind is not None:  # its check knows one image only, and sends that one no gradient
-        behind = behind[0] if len(behind) == 1 and not behind.requires_grad else None
-    tables = projection.means2d, projection.conics, colors, opacities
-    side, room = TILE_SIZE, None
+    side, room, draw = TILE_SIZE, None, _gsplats_image
     if len(opacities) > 0 and _kernels_take(projection, opacities):
         from .tile_lists import room_on
 
         room = room_on(opacities.device)
         if torch.is_grad_enabled() and _tiles(projection, SMALL_TILE) <= MOST_TILES:
             side = SMALL_TILE
+        if torch.is_grad_enabled() and colors.shape[1] == 3 and _compositing_runs_on(colors.device):
+            draw = _our_image
+    tables = projection.means2d, projection.conics, colors, opacities
     shape = projection.width, projection.height, side
     while True:
         lists = _lists(projection, opacities, side, room, colors if leave_out else None)
-        render, alphas = rasterize_to_pixels(*tables, *shape, *lists, backgrounds=behind, packed=True, absgrad=absgrad)
-        if backgrounds is not None and behind is None:
-            render = render + (1.0 - alphas) * backgrounds[:, None, None]
+        render, alphas = draw(tables, backgrounds, shape, lists, absgrad)
         if room is None or room.was_enough():
             return render, alphas, {"isect_offsets": lists[0], "flatten_ids": lists[1], "tile_size": side}
+
+
+def _gsplats_image(
+    tables: tuple[Tensor, ...], backgrounds: Tensor | None, shape: tuple, lists: tuple[Tensor, Tensor], absgrad: bool
+) -> tuple[Tensor, Tensor]:
+    """Render and alphas by gsplat's kernels."""
+    behind = backgrounds
+    if HAS_BATCHES and behind is not None:  # its check knows one image only, and sends that one no gradient
+        behind = behind[0] if len(behind) == 1 and not behind.requires_grad else None
+    render, alphas = rasterize_to_pixels(*tables, *shape, *lists, backgrounds=behind, packed=True, absgrad=absgrad)
+    if backgrounds is not None and behind is None:
+        render = render + (1.0 - alphas) * backgrounds[:, None, None]
+    return render, alphas
+
+
+def _our_image(
+    tables: tuple[Tensor, ...], backgrounds: Tensor | None, shape: tuple, lists: tuple[Tensor, Tensor], absgrad: bool
+) -> tuple[Tensor, Tensor]:
+    """The same of one image of three channels by the kernels of `compositing_triton.py`."""
+    from .compositing_triton import CompositeSplats
+
+    means2d, conics, colors, opacities = (table.contiguous() for table in tables)
+    background = colors.new_zeros(1, 3) if backgrounds is None else backgrounds.contiguous()
+    return CompositeSplats.apply(means2d, conics, opacities, colors, background, *lists, shape, absgrad)
 
 
 def leaves_out(projection: Projection, colors: Tensor, opacities: Tensor) -> bool:
@@ -212,3 +235,16 @@ def _kernels_run_on(device: torch.device) -> None:
     radii = torch.ones(1, 2, dtype=torch.int32, device=device) if HAS_BATCHES else ones[0, :1].int()
     for side in (SMALL_TILE, TILE_SIZE):
         tile_lists(ones[:, :2].contiguous(), radii, ones[0, :1], ones, ones[0, :1], 1, 1, side)
+
+
+@tried_once("Compositing of training images")
+def _compositing_runs_on(device: torch.device) -> None:
+    """Whether the kernels of `compositing_triton.py` run on a device."""
+    from .compositing_triton import CompositeSplats
+
+    leaf = torch.ones(1, 3, device=device, requires_grad=True)
+    begins = torch.tensor([[[0], [1]]], dtype=torch.int32, device=device)
+    for absgrad in (False, True):
+        tables = leaf[:, :2].contiguous(), leaf * 1, leaf[:, 0].contiguous(), leaf * 1, torch.zeros_like(leaf)
+        render, _ = CompositeSplats.apply(*tables, begins, begins[0, 0], (1, 1, SMALL_TILE), absgrad)
+        render.sum().backward()

@@ -1,10 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The kernels of the loss, the growth's statistics and the tiles' lists in Triton's interpreter against their twins."""
+"""The kernels of the loss, the growth's statistics, the tiles' lists and compositing in Triton's interpreter against
+their twins."""
 
 import pytest
 import quick_interpreter  # noqa: F401
 import torch
+from agreement import assert_agrees, judge
+from gsplat_call import Theirs, draw_with_our_kernels, for_our_kernels, rasterization
+from hypothesis import HealthCheck, given, settings
+from make_gsplat_fixtures import CASES, evaluate, upstream
 from ssim_cases import TOLERANCE, assert_near, pair
+from test_against_twin import scenes
 from tile_list_cases import Splats, assert_lists, splats
 from torch.testing import assert_close
 
@@ -12,8 +18,8 @@ from nrfgs_ns.densification.statistics import add_in_torch, raise_in_torch
 from nrfgs_ns.densification.statistics_triton import add, raise_maxima
 from nrfgs_ns.image import ssim_triton
 from nrfgs_ns.image.ssim import photometric_loss
-from nrfgs_ns.rasterizer import TILE_SIZE
-from nrfgs_ns.rasterizer.tile_lists import tile_lists
+from nrfgs_ns.rasterizer import TILE_SIZE, gsplat_cuda
+from nrfgs_ns.rasterizer.tile_lists import FixedRoom, tile_lists
 
 
 # The loss, against pytorch_msssim in float64. A row of a program takes about a tenth of a second, hence small images.
@@ -117,3 +123,56 @@ def test_what_is_not_finite_is_left_out():
     shown = tile_lists(*bad, 4, 3, 16)[1].tolist()  # without a check they are listed, and show
     assert shown.count(1) >= whole.tolist().count(1) > 0 and shown.count(2) >= whole.tolist().count(2)
     assert {3, 4} & set(whole.tolist())
+
+
+# Compositing, from the lists to `absgrad`, against the float64 twin. The room has spare pairs, which are not drawn.
+@pytest.fixture
+def ours(monkeypatch):
+    draw_with_our_kernels(monkeypatch, "cpu")
+    with FixedRoom(2000, torch.device("cpu")).in_use():
+        yield
+
+
+def check(case):
+    grads = upstream(case)
+    assert_agrees(judge(case, grads), evaluate(rasterization, case, grads, "cpu"))
+
+
+@pytest.mark.parametrize("name", ["opaque_layers", "larger_than_image", "needles", "opacities_0_to_1", "capped"])
+def test_hard_cases(ours, name):
+    """Together more splats in a tile than a batch, light that runs out, alphas at both cut-offs and at the cap."""
+    check(for_our_kernels(CASES[name]()))
+
+
+def test_tiles_of_several_blocks(ours, monkeypatch):
+    monkeypatch.setattr(gsplat_cuda, "SMALL_TILE", 16)
+    check(for_our_kernels(CASES["antialiased"]()))
+
+
+@settings(max_examples=20, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(case=scenes().map(for_our_kernels))
+def test_random_scenes(ours, case):
+    check(case)
+
+
+def test_a_background_shines_through_and_has_a_gradient(ours):
+    case, background = CASES["one_splat"](), torch.tensor([[0.3, 0.6, 0.9]], requires_grad=True)
+    black, _, _ = rasterization(*case.arguments())
+    render, alphas, info = rasterization(*case.arguments(), backgrounds=background)
+    assert_close(render, black + (1 - alphas) * background[:, None])
+    assert info["tile_size"] == 8 and info["isect_offsets"].shape == (1, 5, 5)
+    weight = torch.rand(render.shape)
+    (render * weight).sum().backward()
+    assert_close(background.grad, (weight * (1 - alphas)).sum((1, 2)))
+
+
+def test_what_gsplats_kernels_composite(ours, monkeypatch):
+    case = CASES["one_splat"]()
+    rasterization(*case.arguments())
+    with torch.no_grad(), pytest.raises(Theirs):
+        rasterization(*case.arguments())
+    with pytest.raises(Theirs):
+        rasterization(*case.arguments(), render_mode="RGB+ED")
+    monkeypatch.setattr(gsplat_cuda, "_compositing_runs_on", lambda _: False)
+    with pytest.raises(Theirs):
+        rasterization(*case.arguments())

@@ -24,7 +24,7 @@ def test_an_outcome_is_remembered_and_a_failure_reported_once(caplog, monkeypatc
     for _ in range(2):
         assert not gate.opens("broken", CPU, Mock(side_effect=OSError("no compiler\nsearched everywhere")))
     assert gate["broken"] == "Triton's kernels do not run here (OSError: no compiler)"
-    assert [record.getMessage() for record in caplog.records] == [f"It runs in plain PyTorch on cpu: {gate['broken']}."]
+    assert [record.getMessage() for record in caplog.records] == [f"It is slower on cpu: {gate['broken']}."]
     monkeypatch.setattr(trial.importlib.util, "find_spec", lambda name: None)
     assert Gate("It").find("key", CPU, Mock(side_effect=AssertionError("tried"))) == "Triton is not installed"
 

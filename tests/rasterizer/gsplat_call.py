@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`gsplat.rasterization` by `project` and `composite`, for comparisons with gsplat."""
+"""`gsplat.rasterization` by `project` and `composite`, for comparisons with gsplat; and by our kernels alone."""
 
 from dataclasses import replace
 from typing import Any
 
+import pytest
 import torch
+from make_gsplat_fixtures import Case
 from torch import Tensor
 
-from nrfgs_ns.rasterizer import ProjectionOptions, composite, project
+from nrfgs_ns.rasterizer import Projection, ProjectionOptions, composite, project, torch_cpu
 
 
 def rasterization(
@@ -50,3 +52,53 @@ def rasterization(
 
             dense_means2d.register_hook(densify)
     return render, alphas, info
+
+
+class Theirs(Exception):
+    """gsplat's kernels would have composited."""
+
+
+def draw_with_our_kernels(monkeypatch: pytest.MonkeyPatch, device: str, side: int = 8) -> None:
+    """Composite what the CPU has projected by our kernels on a device, in tiles of a side, and never by gsplat's."""
+    from nrfgs_ns.rasterizer import gsplat_cuda
+
+    def theirs(*_: Any) -> None:
+        raise Theirs
+
+    usual = torch_cpu.composite
+
+    def composite(projection: Projection, colors: Tensor, opacities: Tensor, backgrounds: Tensor | None, *how: bool):
+        if len(opacities) == 0:
+            return usual(projection, colors, opacities, backgrounds, *how)
+        tables = {name: value.to(device) for name, value in vars(projection).items() if isinstance(value, Tensor)}
+        moved = replace(projection, **tables)
+        tables = colors.to(device), opacities.to(device), None if backgrounds is None else backgrounds.to(device)
+        render, alphas, lists = gsplat_cuda.composite(moved, *tables, *how)
+        if projection.means2d.requires_grad:
+
+            def leave(_: Tensor) -> None:
+                if hasattr(moved.means2d, "absgrad"):
+                    projection.means2d.absgrad = moved.means2d.absgrad.cpu()
+
+            projection.means2d.register_hook(leave)
+        return render.cpu(), alphas.cpu(), lists
+
+    monkeypatch.setattr(gsplat_cuda, "SMALL_TILE", side)
+    monkeypatch.setattr(gsplat_cuda, "_gsplats_image", theirs)
+    for name in ("_kernels_run_on", "_compositing_runs_on"):
+        monkeypatch.setattr(gsplat_cuda, name, lambda _: True)
+    monkeypatch.setattr(torch_cpu, "composite", composite)
+
+
+def is_ours(case: Case) -> bool:
+    """Whether our kernels composite a case on a GPU: one camera that sees something, three channels."""
+    plain = case.options.get("render_mode", "RGB") == "RGB" and case.colors.shape[-1] == 3
+    return plain and len(case.viewmats) == 1 and bool((case.means[:, 2] > 0).any())
+
+
+def for_our_kernels(case: Case) -> Case:
+    """The first camera of a case, in three channels, over a background."""
+    options = {name: value for name, value in case.options.items() if name in ("near_plane", "rasterize_mode")}
+    options["backgrounds"] = torch.tensor([[0.2, 0.5, -0.8]])
+    colors = torch.cat([case.colors[0] if case.colors.dim() == 3 else case.colors] * 3, dim=1)[:, :3]
+    return replace(case, colors=colors, viewmats=case.viewmats[:1], Ks=case.Ks[:1], options=options)

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 from agreement import BOUNDS, FLOAT32, FLOAT64, assert_agrees, devices, judge
-from gsplat_call import rasterization
-from hypothesis import given, settings
+from gsplat_call import draw_with_our_kernels, for_our_kernels, is_ours, rasterization
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from make_gsplat_fixtures import CASES, Case, _camera, evaluate, load, upstream
+from make_gsplat_fixtures import CASES, Case, _camera, _cloud, evaluate, load, upstream
 
 from nrfgs_ns.rasterizer import ProjectionOptions, contributions, project
 from nrfgs_ns.rasterizer.torch_cpu import batches, compositing, projection
@@ -150,8 +150,32 @@ def test_gsplat_and_the_cpu_agree_with_the_twin(name, monkeypatch):
 
 
 @pytest.mark.gpu
+@pytest.mark.parametrize("kernels", ["ours", "gsplat's"])
 @pytest.mark.parametrize("name", sorted(CASES))
-def test_gpu_back_end_agrees_with_the_twin(name):
+def test_gpu_back_end_agrees_with_the_twin(name, kernels, monkeypatch):
+    """With our compositing and with gsplat's, which are so within twice the tolerance of each other."""
+    from nrfgs_ns.rasterizer import gsplat_cuda
+
     case, bounds = CASES[name](), BOUNDS["cuda"]
+    if kernels == "ours" and is_ours(case):
+        monkeypatch.setattr(gsplat_cuda, "_gsplats_image", None)
+    elif kernels != "ours":
+        monkeypatch.setattr(gsplat_cuda, "_compositing_runs_on", lambda _: False)
     grads = upstream(case, bounds=bounds)
     assert_agrees(judge(case, grads, bounds=bounds), evaluate(rasterization, case, grads, "cuda"))
+
+
+# Our compositing alone; in Triton's interpreter: kernels/small_interpreted.py.
+@pytest.mark.gpu
+class TestOurKernels:
+    @pytest.mark.parametrize("side", [8, 16])
+    def test_a_crowd(self, monkeypatch, side):
+        """Over a hundred splats in each tile: several batches, whose lanes hand light on."""
+        draw_with_our_kernels(monkeypatch, "cuda", side)
+        check(for_our_kernels(_cloud(31, n=300, width=100, height=70)))
+
+    @settings(max_examples=60, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+    @given(case=scenes().map(for_our_kernels), side=st.sampled_from([8, 16]))
+    def test_random_scenes(self, monkeypatch, case, side):
+        draw_with_our_kernels(monkeypatch, "cuda", side)
+        check(case)
