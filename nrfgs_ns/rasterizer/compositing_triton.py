@@ -3,9 +3,8 @@
 
 gsplat's threads are pixels: what they add to a splat's gradient is summed over a warp by shuffles, nine numbers for
 each splat. Here threads are splats, as in the backward pass of Mallick et al., Taming 3DGS (2024). A program, of one
-warp, has a block of pixels and goes through its tile's list in batches of LANES x EACH splats. A thread has EACH
-consecutive splats and some columns of the block, and sums over their pixels in registers. In return, what is left of a
-pixel's light is a scan over the lanes, of one number for EACH splats.
+warp, has a block of pixels and goes through its tile's list in batches of LANES x EACH splats. A thread has EACH of
+them, and sums over its columns of the block in registers. In return, the light that is left is a scan over the lanes.
 
 Splat k covers a pixel with alpha_k = min(0.999, o_k exp(-sigma_k)), counted as 0 below 1/255 or where sigma_k < 0. The
 light behind it is T_k = T_{k-1} (1 - alpha_k), T_0 = 1. The first splat that would bring T_k to 1e-4 or below ends the
@@ -58,24 +57,25 @@ def _rows(table, rows, valid, SIZE: tl.constexpr):
 
 
 @triton.jit
-def _add(table, rows, valid, columns, SIZE: tl.constexpr):
-    """Add to some rows of a table [.., SIZE]."""
+def _add(table, rows, values, SIZE: tl.constexpr):
+    """Add values [BLOCK, LANES], summed over columns of pixels, to rows of a table [.., SIZE]."""
     for i in tl.static_range(SIZE):
-        tl.atomic_add(table + rows * SIZE + i, columns[i], mask=valid, sem="relaxed")
+        total = tl.sum(values[i], axis=0, keep_dims=True)
+        tl.atomic_add(table + rows * SIZE + i, total, mask=total != 0.0, sem="relaxed")
 
 
 @triton.jit
 def _lane(values, lane):
-    """Values [X, LANES] of one lane for each."""
+    """Values [BLOCK, LANES] of one lane for each."""
     return tl.gather(values, tl.zeros_like(values).to(tl.int32) + lane, 1)
 
 
 @triton.jit
 def _block(side, columns):
-    """This program's number and its tile's; columns and first row of its pixels."""
+    """This program's number and its tile's; columns [BLOCK, 1] and first row of its pixels."""
     column, row = tl.program_id(0) * BLOCK, tl.program_id(1) * BLOCK
     program = tl.program_id(1) * tl.num_programs(0) + tl.program_id(0)
-    return program, row // side * columns + column // side, column + tl.arange(0, BLOCK), row
+    return program, row // side * columns + column // side, column + tl.arange(0, BLOCK)[:, None], row
 
 
 @triton.jit
@@ -86,48 +86,50 @@ def _pixels(row, column, width, height):
 
 @triton.jit
 def _batch(ids, at, end, column, means2d, conics, opacities, colors):
-    """A batch of a list, EACH times: splats; distances along x [X, LANES]; -log2(e) times sigma's terms xx / 2 at these
-    distances, xx / 2, xy and yy / 2; y of the centre; log2 of the opacity; colours."""
+    """A batch of a list, EACH times: splats; distances along x [BLOCK, LANES]; -log2(e) times sigma's terms xx / 2 at
+    these distances, xx / 2, xy and yy / 2; y of the centre; log2 of the opacity; colours. [1, LANES]"""
     splats = ()
     for k in tl.static_range(EACH):
-        place = at + tl.arange(0, LANES) * EACH + k
+        place = at + tl.arange(0, LANES)[None, :] * EACH + k
         valid = place < end
         splat = tl.load(ids + place, mask=valid, other=0)
         x, y = _rows(means2d, splat, valid, 2)
         a, b, c = _rows(conics, splat, valid, 3)
         a, b, c = a * (-0.5 * LOG2_E), b * -LOG2_E, c * (-0.5 * LOG2_E)
-        dx = x[None, :] - (column.to(tl.float32) + 0.5)[:, None]
+        dx = x - (column.to(tl.float32) + 0.5)
         opacity = tl.load(opacities + splat, mask=valid, other=0.0)
         peak = tl.where(opacity <= 0.0, -float("inf"), tl.log2(opacity))
-        splats += ((splat, dx, a[None, :] * dx * dx, a, b, c, y, peak, _rows(colors, splat, valid, 3)),)
+        splats += ((splat, dx, a * dx * dx, a, b, c, y, peak, _rows(colors, splat, valid, 3)),)
     return splats
 
 
 @triton.jit
 def _blend(splats, row, left):
-    """A batch at a row of pixels that have T = `left` in front of it: EACH times o exp(-sigma), alpha (0: not drawn), T
-    in front of the splat and T behind it; then T behind the batch. All [X, LANES].
+    """A batch at a row of pixels, with T = `left` in front of it: EACH times o exp(-sigma), alpha (0: not drawn) and w;
+    T behind the last splat that a thread draws; T behind the batch. [BLOCK, LANES]
 
     Sums of products are spelt out, so that both kernels draw the same splats."""
     shown, alphas, passed = (), (), ()
     for k in tl.static_range(EACH):
         _, dx, along_x, _, b, c, y, peak, _ = splats[k]
         dy = y - (row.to(tl.float32) + 0.5)
-        power = tl.fma(dx, (b * dy)[None, :], along_x + tl.fma(c * dy, dy, peak)[None, :])
+        power = tl.fma(dx, b * dy, along_x + tl.fma(c * dy, dy, peak))
         value = tl.exp2(power)
         alpha = tl.minimum(value, MAX_ALPHA)
-        alpha = tl.where((power > peak[None, :]) | (alpha < MIN_ALPHA), 0.0, alpha)
+        alpha = tl.where((power > peak) | (alpha < MIN_ALPHA), 0.0, alpha)
         passes = (1.0 - alpha) if k == 0 else passed[k - 1] * (1.0 - alpha)
         shown, alphas, passed = shown + (value,), alphas + (alpha,), passed + (passes,)
     scan = tl.cumprod(passed[EACH - 1], 1)
     lane = tl.arange(0, LANES)[None, :]
     front = left * tl.where(lane == 0, 1.0, _lane(scan, tl.maximum(lane - 1, 0)))
-    drawn, before, behind = (), (), ()
+    drawn, weights, before, last = (), (), front, front
     for k in tl.static_range(EACH):
-        before += (front if k == 0 else behind[k - 1],)
-        behind += (front * passed[k],)
-        drawn += (tl.where(behind[k] > MIN_TRANSMITTANCE, alphas[k], 0.0),)
-    return shown, drawn, before, behind, left * _lane(scan, LANES - 1)
+        behind = front * passed[k]
+        alpha = tl.where(behind > MIN_TRANSMITTANCE, alphas[k], 0.0)
+        drawn, weights = drawn + (alpha,), weights + (alpha * before,)
+        last = tl.where(behind > MIN_TRANSMITTANCE, behind, last)
+        before = behind
+    return shown, drawn, weights, last, left * _lane(scan, LANES - 1)
 
 
 @triton.jit(do_not_specialize=["width", "height", "side", "columns"])
@@ -140,20 +142,18 @@ def forward_kernel(
     rows = ()
     for row in tl.static_range(BLOCK):
         pixel, inside = _pixels(top + row, column, width, height)
-        rows += ((tl.where(inside, 1.0, 0.0)[:, None] + none, none, none, none, none),)
+        rows += ((tl.where(inside, 1.0, none), none, none, none, none),)
     at, end, live = tl.load(begins + tile), tl.load(begins + tile + 1), 1
     while (at < end) & (live > 0):
         splats = _batch(ids, at, end, column, means2d, conics, opacities, colors)
         new_rows, most_left = (), none
         for row in tl.static_range(BLOCK):
             left, red, green, blue, covered = rows[row]
-            _, drawn, before, _, left = _blend(splats, top + row, left)
+            _, _, weights, _, left = _blend(splats, top + row, left)
             for k in tl.static_range(EACH):
-                weight, color = drawn[k] * before[k], splats[k][8]
-                red = tl.fma(weight, color[0][None, :], red)
-                green = tl.fma(weight, color[1][None, :], green)
-                blue = tl.fma(weight, color[2][None, :], blue)
-                covered += weight
+                color = splats[k][8]
+                red, green = tl.fma(weights[k], color[0], red), tl.fma(weights[k], color[1], green)
+                blue, covered = tl.fma(weights[k], color[2], blue), covered + weights[k]
             new_rows, most_left = new_rows + ((left, red, green, blue, covered),), tl.maximum(most_left, left)
         rows = new_rows
         at += LANES * EACH
@@ -162,11 +162,11 @@ def forward_kernel(
     tl.store(ends + program, tl.minimum(at, end))
     for row in tl.static_range(BLOCK):
         pixel, inside = _pixels(top + row, column, width, height)
-        alpha = tl.sum(rows[row][4], axis=1)
+        alpha = tl.sum(rows[row][4], axis=1, keep_dims=True)
         tl.store(alphas + pixel, alpha, mask=inside)
-        for channel in tl.static_range(3):
-            color = tl.fma(1.0 - alpha, tl.load(background + channel), tl.sum(rows[row][1 + channel], axis=1))
-            tl.store(render + pixel * 3 + channel, color, mask=inside)
+        for i in tl.static_range(3):
+            color = tl.sum(rows[row][1 + i], axis=1, keep_dims=True)
+            tl.store(render + pixel * 3 + i, tl.fma(1.0 - alpha, tl.load(background + i), color), mask=inside)
 
 
 @triton.jit(do_not_specialize=["width", "height", "side", "columns"])
@@ -181,11 +181,11 @@ def backward_kernel(
     for step in tl.static_range(BLOCK):
         pixel, inside = _pixels(top + step, column, width, height)
         upstream, rgb = _rows(d_render, pixel, inside, 3), _rows(render, pixel, inside, 3)
-        light = tl.load(alphas + pixel, mask=inside, other=0.0) - 1.0
-        value = tl.load(d_alphas + pixel, mask=inside, other=0.0) * light
-        for channel in tl.static_range(3):
-            value = tl.fma(upstream[channel], rgb[channel], value)
-        left, worth = left + (tl.where(inside, 1.0, 0.0)[:, None] + none,), worth + (value[:, None] + none,)
+        value = tl.load(alphas + pixel, mask=inside, other=0.0) - 1.0
+        value *= tl.load(d_alphas + pixel, mask=inside, other=0.0)
+        for i in tl.static_range(3):
+            value = tl.fma(upstream[i], rgb[i], value)
+        left, worth = left + (tl.where(inside, 1.0, none),), worth + (value + none,)
     end = tl.load(begins + tile + 1)
     for at in range(tl.load(begins + tile), tl.load(ends + program), LANES * EACH):
         splats = _batch(ids, at, end, column, means2d, conics, opacities, colors)
@@ -195,18 +195,14 @@ def backward_kernel(
         for row in range(BLOCK):
             pixel, inside = _pixels(top + row, column, width, height)
             red, green, blue = _rows(d_render, pixel, inside, 3)
-            red, green, blue = red[:, None], green[:, None], blue[:, None]
-            shown, drawn, before, behind, new_left = _blend(splats, top + row, left[0])
-            weights, gains, total, last = (), (), none, before[0]  # last: T behind the thread's last drawn splat
+            shown, drawn, weights, last, new_left = _blend(splats, top + row, left[0])
+            gains, total = (), none
             for k in tl.static_range(EACH):
                 color = splats[k][8]
-                gain = tl.fma(blue, color[2][None, :], green * color[1][None, :])
-                gains += (tl.fma(red, color[0][None, :], gain),)
-                weights += (drawn[k] * before[k],)
+                gains += (tl.fma(red, color[0], tl.fma(green, color[1], blue * color[2])),)
                 total = tl.fma(weights[k], gains[k], total)
-                last = tl.where(behind[k] > MIN_TRANSMITTANCE, behind[k], last)
             scan = tl.cumsum(total, 1)
-            mean = (worth[0] - scan) / tl.maximum(last, MIN_TRANSMITTANCE)  # R_k / T_k
+            mean = (worth[0] - scan) / tl.maximum(last, MIN_TRANSMITTANCE)  # R_k / T_k of a thread's last splat
             left, worth = left[1:] + (new_left,), worth[1:] + (worth[0] - _lane(scan, LANES - 1),)
             new_sums = ()
             for k in tl.static_range(EACH - 1, -1, -1):
@@ -216,27 +212,24 @@ def backward_kernel(
                 mean = tl.fma(drawn[k], more, mean)
                 v = tl.where(shown[k] <= MAX_ALPHA, weights[k] * more, 0.0)
                 dy = y - ((top + row).to(tl.float32) + 0.5)
-                by_0, by_y, by_yy = by_0 + v, tl.fma(v, dy[None, :], by_y), tl.fma(v, (dy * dy)[None, :], by_yy)
+                by_0, by_y, by_yy = by_0 + v, tl.fma(v, dy, by_y), tl.fma(v, dy * dy, by_yy)
                 by_red, by_green = tl.fma(weights[k], red, by_red), tl.fma(weights[k], green, by_green)
                 by_blue = tl.fma(weights[k], blue, by_blue)
                 if ABSGRAD:
-                    abs_x = tl.fma(tl.abs(v), tl.abs(tl.fma(2.0 * a[None, :], dx, (b * dy)[None, :])), abs_x)
-                    abs_y = tl.fma(tl.abs(v), tl.abs(tl.fma(b[None, :], dx, (2.0 * c * dy)[None, :])), abs_y)
+                    abs_x = tl.fma(tl.abs(v), tl.abs(tl.fma(2.0 * a, dx, b * dy)), abs_x)
+                    abs_y = tl.fma(tl.abs(v), tl.abs(tl.fma(b, dx, 2.0 * c * dy)), abs_y)
                 new_sums = ((by_0, by_y, by_yy, by_red, by_green, by_blue, abs_x, abs_y),) + new_sums
             sums = new_sums
         for k in tl.static_range(EACH):
             splat, dx, _, a, b, c, _, _, _ = splats[k]
             v, by_y, by_yy, by_red, by_green, by_blue, abs_x, abs_y = sums[k]
-            by_0, by_x, by_xx = tl.sum(v, axis=0), tl.sum(v * dx, axis=0) * LN_2, tl.sum(v * dx * dx, axis=0)
-            by_xy, by_y, by_yy = tl.sum(by_y * dx, axis=0), tl.sum(by_y, axis=0) * LN_2, tl.sum(by_yy, axis=0)
-            color = tl.sum(by_red, axis=0), tl.sum(by_green, axis=0), tl.sum(by_blue, axis=0)
-            some = (by_0 != 0.0) | (color[0] != 0.0) | (color[1] != 0.0) | (color[2] != 0.0)
-            _add(d_colors, splat, some, color, 3)
-            _add(d_opacities, splat, some, (by_0 / tl.load(opacities + splat, mask=some, other=1.0),), 1)
-            _add(d_means2d, splat, some, (2.0 * a * by_x + b * by_y, b * by_x + 2.0 * c * by_y), 2)
-            _add(d_conics, splat, some, (-0.5 * by_xx, -by_xy, -0.5 * by_yy), 3)
+            by_x = v * dx
+            _add(d_colors, splat, (by_red, by_green, by_blue), 3)
+            _add(d_opacities, splat, (v * (1.0 / tl.maximum(tl.load(opacities + splat), MIN_ALPHA)),), 1)
+            _add(d_means2d, splat, ((2.0 * a * by_x + b * by_y) * LN_2, (b * by_x + 2.0 * c * by_y) * LN_2), 2)
+            _add(d_conics, splat, (-0.5 * by_x * dx, -by_y * dx, -0.5 * by_yy), 3)
             if ABSGRAD:
-                _add(absgrad, splat, some, (tl.sum(abs_x, axis=0) * LN_2, tl.sum(abs_y, axis=0) * LN_2), 2)
+                _add(absgrad, splat, (abs_x * LN_2, abs_y * LN_2), 2)
 
 
 launch_forward, launch_backward = Launcher(forward_kernel), Launcher(backward_kernel)

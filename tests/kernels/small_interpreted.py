@@ -149,7 +149,7 @@ def test_tiles_of_several_blocks(ours, monkeypatch):
     check(for_our_kernels(CASES["antialiased"]()))
 
 
-@settings(max_examples=20, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=12, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(case=scenes().map(for_our_kernels))
 def test_random_scenes(ours, case):
     check(case)
