@@ -17,9 +17,9 @@ With g = dL/dC, h = dL/dA and s_k = w_k c_k . g, all that lies behind splat k ad
     dL/dsigma_k = -w_k (c_k . g - R_k / T_k),
     R_k = sum_{j > k} s_j + T_n (g . b - h) = g . C - h T_n - sum_{j <= k} s_j,
 
-so that the backward pass goes front to back too. As a difference R_k is off by some rounding units of sum_j |s_j|,
-which counts where little light is left. gsplat goes back to front from a T_n that has been rounded as 1 - A: its w_k
-are off by a rounding unit / T_n of themselves.
+so that the backward pass goes front to back too. As a difference R_k is off by rounding units of sum_j |s_j|, and so
+dL/do_k by 1 / (1 - alpha_k) of that, up to a thousand times. gsplat goes back to front from a T_n that has been rounded
+as 1 - A: its w_k are off by a rounding unit / T_n of themselves.
 
 Pixels of a column have the same distance dx from a splat's centre, pixels of a row the same dy. So gradients of centres
 and conics are sums over columns of three numbers: v = -dL/dsigma, v dy and v dy^2.
@@ -86,8 +86,8 @@ def _pixels(row, column, width, height):
 
 @triton.jit
 def _batch(ids, at, end, column, means2d, conics, opacities, colors):
-    """A batch of a list, EACH times: splats; distances along x [BLOCK, LANES]; -log2(e) times sigma's terms xx / 2 at
-    these distances, xx / 2, xy and yy / 2; y of the centre; log2 of the opacity; colours. [1, LANES]"""
+    """A batch of a list, EACH times: splats; dx and a dx [BLOCK, LANES]; b and c; the centre's y; log2 of the opacity;
+    colours. a dx^2 + b dx dy + c dy^2 is -log2(e) sigma. [1, LANES]"""
     splats = ()
     for k in tl.static_range(EACH):
         place = at + tl.arange(0, LANES)[None, :] * EACH + k
@@ -99,7 +99,7 @@ def _batch(ids, at, end, column, means2d, conics, opacities, colors):
         dx = x - (column.to(tl.float32) + 0.5)
         opacity = tl.load(opacities + splat, mask=valid, other=0.0)
         peak = tl.where(opacity <= 0.0, -float("inf"), tl.log2(opacity))
-        splats += ((splat, dx, a * dx * dx, a, b, c, y, peak, _rows(colors, splat, valid, 3)),)
+        splats += ((splat, dx, a * dx, b, c, y, peak, _rows(colors, splat, valid, 3)),)
     return splats
 
 
@@ -111,9 +111,9 @@ def _blend(splats, row, left):
     Sums of products are spelt out, so that both kernels draw the same splats."""
     shown, alphas, passed = (), (), ()
     for k in tl.static_range(EACH):
-        _, dx, along_x, _, b, c, y, peak, _ = splats[k]
+        _, dx, a_dx, b, c, y, peak, _ = splats[k]
         dy = y - (row.to(tl.float32) + 0.5)
-        power = tl.fma(dx, b * dy, along_x + tl.fma(c * dy, dy, peak))
+        power = tl.fma(dx, tl.fma(b, dy, a_dx), tl.fma(c * dy, dy, peak))
         value = tl.exp2(power)
         alpha = tl.minimum(value, MAX_ALPHA)
         alpha = tl.where((power > peak) | (alpha < MIN_ALPHA), 0.0, alpha)
@@ -151,7 +151,7 @@ def forward_kernel(
             left, red, green, blue, covered = rows[row]
             _, _, weights, _, left = _blend(splats, top + row, left)
             for k in tl.static_range(EACH):
-                color = splats[k][8]
+                color = splats[k][7]
                 red, green = tl.fma(weights[k], color[0], red), tl.fma(weights[k], color[1], green)
                 blue, covered = tl.fma(weights[k], color[2], blue), covered + weights[k]
             new_rows, most_left = new_rows + ((left, red, green, blue, covered),), tl.maximum(most_left, left)
@@ -198,7 +198,7 @@ def backward_kernel(
             shown, drawn, weights, last, new_left = _blend(splats, top + row, left[0])
             gains, total = (), none
             for k in tl.static_range(EACH):
-                color = splats[k][8]
+                color = splats[k][7]
                 gains += (tl.fma(red, color[0], tl.fma(green, color[1], blue * color[2])),)
                 total = tl.fma(weights[k], gains[k], total)
             scan = tl.cumsum(total, 1)
@@ -206,7 +206,7 @@ def backward_kernel(
             left, worth = left[1:] + (new_left,), worth[1:] + (worth[0] - _lane(scan, LANES - 1),)
             new_sums = ()
             for k in tl.static_range(EACH - 1, -1, -1):
-                _, dx, _, a, b, c, y, _, _ = splats[k]
+                _, dx, a_dx, b, c, y, _, _ = splats[k]
                 by_0, by_y, by_yy, by_red, by_green, by_blue, abs_x, abs_y = sums[k]
                 more = gains[k] - mean
                 mean = tl.fma(drawn[k], more, mean)
@@ -216,17 +216,17 @@ def backward_kernel(
                 by_red, by_green = tl.fma(weights[k], red, by_red), tl.fma(weights[k], green, by_green)
                 by_blue = tl.fma(weights[k], blue, by_blue)
                 if ABSGRAD:
-                    abs_x = tl.fma(tl.abs(v), tl.abs(tl.fma(2.0 * a, dx, b * dy)), abs_x)
+                    abs_x = tl.fma(tl.abs(v), tl.abs(tl.fma(2.0, a_dx, b * dy)), abs_x)
                     abs_y = tl.fma(tl.abs(v), tl.abs(tl.fma(b, dx, 2.0 * c * dy)), abs_y)
                 new_sums = ((by_0, by_y, by_yy, by_red, by_green, by_blue, abs_x, abs_y),) + new_sums
             sums = new_sums
         for k in tl.static_range(EACH):
-            splat, dx, _, a, b, c, _, _, _ = splats[k]
+            splat, dx, a_dx, b, c, _, _, _ = splats[k]
             v, by_y, by_yy, by_red, by_green, by_blue, abs_x, abs_y = sums[k]
             by_x = v * dx
             _add(d_colors, splat, (by_red, by_green, by_blue), 3)
             _add(d_opacities, splat, (v * (1.0 / tl.maximum(tl.load(opacities + splat), MIN_ALPHA)),), 1)
-            _add(d_means2d, splat, ((2.0 * a * by_x + b * by_y) * LN_2, (b * by_x + 2.0 * c * by_y) * LN_2), 2)
+            _add(d_means2d, splat, ((2.0 * v * a_dx + b * by_y) * LN_2, (b * by_x + 2.0 * c * by_y) * LN_2), 2)
             _add(d_conics, splat, (-0.5 * by_x * dx, -by_y * dx, -0.5 * by_yy), 3)
             if ABSGRAD:
                 _add(absgrad, splat, (abs_x * LN_2, abs_y * LN_2), 2)

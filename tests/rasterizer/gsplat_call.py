@@ -90,12 +90,6 @@ def draw_with_our_kernels(monkeypatch: pytest.MonkeyPatch, device: str, side: in
     monkeypatch.setattr(torch_cpu, "composite", composite)
 
 
-def is_ours(case: Case) -> bool:
-    """Whether our kernels composite a case on a GPU: one camera that sees something, three channels."""
-    plain = case.options.get("render_mode", "RGB") == "RGB" and case.colors.shape[-1] == 3
-    return plain and len(case.viewmats) == 1 and bool((case.means[:, 2] > 0).any())
-
-
 def for_our_kernels(case: Case) -> Case:
     """The first camera of a case, in three channels, over a background."""
     options = {name: value for name, value in case.options.items() if name in ("near_plane", "rasterize_mode")}

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from agreement import BOUNDS, FLOAT32, FLOAT64, assert_agrees, devices, judge
-from gsplat_call import draw_with_our_kernels, for_our_kernels, is_ours, rasterization
+from gsplat_call import draw_with_our_kernels, for_our_kernels, rasterization
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from make_gsplat_fixtures import CASES, Case, _camera, _cloud, evaluate, load, upstream
@@ -157,9 +157,7 @@ def test_gpu_back_end_agrees_with_the_twin(name, kernels, monkeypatch):
     from nrfgs_ns.rasterizer import gsplat_cuda
 
     case, bounds = CASES[name](), BOUNDS["cuda"]
-    if kernels == "ours" and is_ours(case):
-        monkeypatch.setattr(gsplat_cuda, "_gsplats_image", None)
-    elif kernels != "ours":
+    if kernels == "gsplat's":
         monkeypatch.setattr(gsplat_cuda, "_compositing_runs_on", lambda _: False)
     grads = upstream(case, bounds=bounds)
     assert_agrees(judge(case, grads, bounds=bounds), evaluate(rasterization, case, grads, "cuda"))

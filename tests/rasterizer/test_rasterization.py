@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The call: arguments, layouts, errors, and what gsplat's strategies need of `info`."""
+"""The call: arguments, layouts, errors, and what gsplat's strategies need of `info`. The lists against their definition:
+every splat that reaches a pixel is listed there, in order, and little else."""
 
 import math
 import subprocess
@@ -8,9 +9,12 @@ import sys
 import pytest
 import torch
 from gsplat_call import rasterization
-from make_gsplat_fixtures import CASES
+from make_gsplat_fixtures import CASES, _camera
+from tile_list_cases import Splats, assert_lists, splats
 
+from nrfgs_ns.rasterizer import TILE_SIZE, ProjectionOptions, composite, project
 from nrfgs_ns.rasterizer.torch_cpu import batches, compositing
+from nrfgs_ns.rasterizer.torch_cpu.tiles import SUB_TILE, footprints, list_tiles
 
 
 def test_info_has_gsplats_keys():
@@ -148,3 +152,139 @@ def test_peak_memory_is_bounded(size):
     command = [sys.executable, "-c", PEAK, "200000", *map(str, size)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     assert float(done.stdout) < 1024
+
+
+# The lists.
+@pytest.mark.parametrize("name", [n for n in CASES if n not in ("nothing_visible", "near_plane")])
+def test_lists_are_complete_ordered_and_tight(name):
+    """The ellipse can pass between pixel centres of a tile that it enters, so some pairs turn out empty. Never most of
+    them for splats wider than a pixel; a bounding box would list three times too many for the needles."""
+    case, spare = CASES[name](), 0
+    with torch.no_grad():
+        seen = project(case.means, case.quats, case.scales, case.viewmats, case.Ks, case.width, case.height)
+    of = Splats(seen.means2d, seen.radii, seen.depths, seen.conics, case.opacities[seen.gaussian_ids])
+    prints = footprints(seen, of.opacities)
+    lists = list_tiles(prints, prints.whole)
+    counts = torch.zeros(seen.n_cameras * prints.tiles_y * prints.tiles_x, dtype=torch.int64)
+    counts[lists.tiles] = lists.count
+    counts = counts.view(seen.n_cameras, -1)
+    rows = prints.rows[lists.splat[:-1]].int().split(counts.sum(dim=1).tolist())
+    for camera, mine in enumerate(rows):
+        own = seen.camera_ids == camera
+        begins = torch.cat([counts[camera].cumsum(0) - counts[camera], torch.full((prints.tiles_x,), len(mine))])
+        lists_of_camera = begins.view(1, -1, prints.tiles_x).int(), mine - own.int().argmax()
+        of_camera = Splats(*(table[own] for table in of))
+        spare += assert_lists(*lists_of_camera, of_camera, prints.tiles_x, prints.tiles_y, SUB_TILE, TILE_SIZE)
+    assert lists.n_pairs <= 1.5 * (lists.n_pairs - spare) + 20
+
+
+def test_blocks_without_a_pair(monkeypatch):
+    """A diagonal needle misses most blocks of its bounding box: single sub-tiles, listed with nothing in them."""
+    K = torch.tensor([[[60.0, 0.0, 50.0], [0.0, 60.0, 50.0], [0.0, 0.0, 1.0]]])
+    needle = [torch.tensor([row]) for row in ([0.0, 0.0, 2.0], [0.924, 0.0, 0.0, 0.383], [2.0, 1e-3, 1e-3])]
+    arguments = (*needle, torch.tensor([0.9]), torch.ones(1, 3, requires_grad=True), torch.eye(4)[None], K, 100, 100)
+    whole, _, _ = rasterization(*arguments)
+    monkeypatch.setattr(compositing, "BLOCK_PAIRS", 1)
+    parts, _, _ = rasterization(*arguments)
+    torch.testing.assert_close(parts, whole)
+    parts.sum().backward()
+    torch.testing.assert_close(arguments[4].grad.sum(), whole.sum().detach())
+
+
+# Projection: extreme gradients, and the order of rows.
+W, H = 40, 28
+ANTIALIASED = ProjectionOptions("antialiased")
+
+
+def test_flat_splat_has_finite_gradients():
+    """Seen edge on, a disc of thickness 0 has det = 0 and compensation 0: sqrt would send an infinity back."""
+    scales = torch.tensor([[0.0, 0.1, 0.1]], requires_grad=True)
+    splat = torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), scales
+    p = project(*splat, torch.eye(4)[None], _camera(W, H)[None], W, H, ANTIALIASED)
+    p.compensations.sum().backward()
+    assert p.compensations.item() == 0 and torch.isfinite(scales.grad).all()
+
+
+@pytest.mark.parametrize("near", [0.012, 0.1, 1.0])
+def test_gradients_of_compensations_near_the_camera(near):
+    """What the blur adds to the determinant of a large splat is below float32's rounding of either determinant.
+    Each entry is a sum of some ten products: it may be off by 64 rounding units of the largest."""
+    g = torch.Generator().manual_seed(0)
+    depth = near * (1 + torch.rand(500, generator=g))
+    means = torch.cat([0.3 * depth[:, None] * torch.randn(500, 2, generator=g), depth[:, None]], 1)
+    quats, scales = torch.randn(500, 4, generator=g), torch.exp(0.5 * torch.randn(500, 3, generator=g))
+
+    def gradients(dtype: torch.dtype) -> list[torch.Tensor]:
+        splats = [table.to(dtype, copy=True).requires_grad_() for table in (means, quats, scales)]
+        camera = torch.eye(4, dtype=dtype)[None], _camera(W, H)[None].to(dtype)
+        project(*splats, *camera, W, H, ANTIALIASED).compensations.sum().backward()
+        return [table.grad.double() for table in splats]
+
+    for ours, exact in zip(gradients(torch.float32), gradients(torch.float64), strict=True):
+        assert (ours - exact).abs().max() <= 64 * 2**-24 * exact.abs().max()
+
+
+def test_rows_are_ordered_by_camera_then_splat():
+    case = CASES["several_cameras"]()
+    p = project(case.means, case.quats, case.scales, case.viewmats, case.Ks, case.width, case.height)
+    key = p.camera_ids * len(case.means) + p.gaussian_ids
+    assert torch.equal(key, key.sort().values) and len(key.unique()) == len(key)
+    assert p.camera_ids.dtype == p.gaussian_ids.dtype == torch.int64 and p.radii.dtype == torch.int32
+
+
+# On a GPU: gsplat's images and gradients from the lists. In Triton's interpreter: kernels/small_interpreted.py.
+@pytest.mark.gpu
+class TestOnCuda:
+    @pytest.mark.parametrize("shape", [(19, 13, 16), (38, 25, 8)])
+    def test_tiles_list_what_draws_in_them(self, shape):
+        from nrfgs_ns.rasterizer.tile_lists import tile_lists
+
+        of = splats(3000, 300, 200)
+        lists = tile_lists(*(table.cuda() for table in of), *shape)
+        assert_lists(*(part.cpu() for part in lists), of, *shape, TILE_SIZE)
+
+    @pytest.mark.parametrize("mode", ["RGB", "RGB+ED"])
+    @pytest.mark.parametrize("rasterize_mode", ["classic", "antialiased"])
+    def test_images_and_gradients_are_those_of_gsplats_lists(self, monkeypatch, mode, rasterize_mode):
+        """Both by gsplat's kernels."""
+        from nrfgs_ns.rasterizer import gsplat_cuda
+
+        monkeypatch.setattr(gsplat_cuda, "_compositing_runs_on", lambda _: False)
+        count = 5000
+        generator = torch.Generator().manual_seed(0)
+
+        def random(*shape: int) -> torch.Tensor:
+            return torch.randn(*shape, generator=generator).cuda()
+
+        tables = [2 * random(count, 3), random(count, 4), (0.7 * random(count, 3) - 3).exp()]
+        tables[0][:, 2] += 6.0
+        tables += [torch.sigmoid(random(count, 3)), torch.sigmoid(2 * random(count) - 1)]
+        upstream = random(1, 200, 300, 3 if mode == "RGB" else 4)
+
+        camera = torch.eye(4).cuda()[None], torch.tensor([[[200.0, 0, 150], [0, 200, 100], [0, 0, 1]]]).cuda(), 300, 200
+
+        def render() -> tuple[list[torch.Tensor], int]:
+            """Image and gradients, and the number of pairs of splats and tiles."""
+            leaves = [table.clone().requires_grad_() for table in tables]
+            *geometry, colors, opacities = leaves
+            seen = project(*geometry, *camera, ProjectionOptions(rasterize_mode, assume_finite=True))
+            rows, options = seen.gaussian_ids, {"with_depth": mode == "RGB+ED", "assume_finite": True}
+            background = torch.full((1, 3), 0.3).cuda()
+            image, _, info = composite(seen, colors[rows], opacities[rows], backgrounds=background, **options)
+            image.backward(upstream)
+            offsets, pairs = info["isect_offsets"], len(info["flatten_ids"])
+            if offsets.shape[1] > info["tile_height"]:  # the row below the image has spare room
+                pairs = int(offsets[0, -1, 0])
+            return [image.detach(), *(leaf.grad for leaf in leaves)], pairs
+
+        assert gsplat_cuda._kernels_run_on(torch.device("cuda", 0))
+        small = render()
+        monkeypatch.setattr(gsplat_cuda, "SMALL_TILE", TILE_SIZE)
+        large = render()
+        monkeypatch.setattr(gsplat_cuda, "MOST_TILES", 0)
+        theirs, all_pairs = render()
+        assert large[1] <= all_pairs and large[1] <= small[1] <= 4 * large[1]
+        for mine, _ in (small, large):
+            torch.testing.assert_close(mine[0], theirs[0], rtol=0, atol=2e-6)
+            for got, expected in zip(mine[1:], theirs[1:], strict=True):
+                assert (got - expected).norm() <= 1e-5 * expected.norm()  # atomics add in any order
