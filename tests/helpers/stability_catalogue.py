@@ -31,7 +31,7 @@ from nrfgs_ns.rasterizer.torch_cpu.projection import LARGEST_RADIUS, MIN_QUATERN
 from nrfgs_ns.training.guard import MAX_GRADIENT
 
 HEAD, RASTER = "tests/appearance/test_stability_head.py", "tests/rasterizer/test_stability_rasterizer.py"
-GUARD, PROJECTION = "tests/training/test_guard.py", "tests/rasterizer/test_tiles.py"
+GUARD, PROJECTION = "tests/training/test_guard.py", "tests/rasterizer/test_rasterization.py"
 SIDE = 16
 """Pixels along a side of the image that the checks draw."""
 SHAPE = {"means": [0.0, 0.0, 2.0], "quats": [1.0, 0.0, 0.0, 0.0], "scales": [0.1] * 3}

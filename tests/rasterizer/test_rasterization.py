@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The call: arguments, layouts, errors, and what gsplat's strategies need of `info`. The lists against their definition:
-every splat that reaches a pixel is listed there, in order, and little else."""
+"""The call: arguments, layouts, errors, and what gsplat's strategies need of `info`. The tiles' lists against their
+definition: every splat that reaches a pixel is listed there, in order, and little else."""
 
 import math
 import subprocess
