@@ -168,9 +168,10 @@ def test_gpu_back_end_agrees_with_the_twin(name, kernels, monkeypatch):
 class TestOurKernels:
     @pytest.mark.parametrize("side", [8, 16])
     def test_a_crowd(self, monkeypatch, side):
-        """Over a hundred splats in each tile: several batches, whose lanes hand light on."""
+        """Around 130 splats in each tile: several batches, which hand light on."""
         draw_with_our_kernels(monkeypatch, "cuda", side)
-        check(for_our_kernels(_cloud(31, n=300, width=100, height=70)))
+        larger = {"scales": lambda s: 4 * s, "opacities": lambda o: 0.2 * o}
+        check(for_our_kernels(_cloud(31, n=300, width=100, height=70, **larger)))
 
     @settings(max_examples=60, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
     @given(case=scenes().map(for_our_kernels), side=st.sampled_from([8, 16]))
