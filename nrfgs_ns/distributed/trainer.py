@@ -77,38 +77,15 @@ class ShardedPipeline(NrfgsPipeline):
 
 class ShardedMean(ParameterMean):
     """`ParameterMean` of one device's splats and of the shared weights. If one device must restart, all do, so that
-    shared weights stay the same. All methods except `install` and `state` must be called on all devices."""
+    shared weights stay the same. It is in no checkpoint: a training that goes on averages its own steps."""
 
     def is_current(self, optimizers: Mapping[str, Optimizer]) -> bool:
         """Whether the rows of all devices still denote the splats that were averaged. The host waits for the answer."""
         here = super().is_current(optimizers)
         return all(comm.gather_counts(int(here), parameters_of(next(iter(optimizers.values())))[0].device))
 
-    def whole_state(self, model, optimizers: Mapping[str, Optimizer]) -> dict[str, Any]:
-        """A checkpoint's "parameter_mean", with the splats' rows of all devices on the main one, and None elsewhere; {}
-        where the guard has removed splats of any device since. `model` is a ShardedModel whose splats are counted."""
-        if not self.is_current(optimizers):
-            return {}
-        state = self.state()
-        for name, mean in state["means"].items():
-            if _is_per_splat(name, model):
-                state["means"][name] = comm.gather_rows(mean, model.counts)
-        return {"parameter_mean": state}
-
-    def load_state(self, state: Mapping[str, Any], model, optimizers: Mapping[str, Optimizer]) -> None:
-        """Go on from this device's rows of a whole checkpoint's `state`; see `ParameterMean.load_state`."""
-        means, total = dict(state["means"]), sum(model.counts)
-        for name, mean in means.items():
-            if _is_per_splat(name, model):
-                if len(mean) != total:  # its rows could fit one device and not another
-                    return
-                means[name] = mean[model.loaded].contiguous()
-        super().load_state({**state, "means": means}, model, optimizers)
-
-
-def _is_per_splat(name: str, model) -> bool:
-    """Whether a parameter, by its group and its place in it, has a row for each splat."""
-    return name.rpartition(".")[0] in model.gauss_params
+    def load_state(self, state: Mapping[str, Any], optimizers: Mapping[str, Optimizer]) -> None:
+        """Leave the mean of a checkpoint of one device alone."""
 
 
 class ShardedGuard(Guard):
@@ -235,9 +212,8 @@ class ShardedTrainer(NrfgsTrainer):
         pipeline["_model._extra_state"]["shards"] = model.counts
         for name in model.gauss_params:
             content["optimizers"][name] = map_moments(content["optimizers"][name], gathered)
-        training, extra = content["training"], pipeline["_extra_state"]
-        if training.pop("parameter_mean", None) is not None:  # on all devices, or on none
-            training |= self.mean.whole_state(model, self.optimizers.optimizers)
+        content["training"].pop("parameter_mean", None)
+        extra = pipeline["_extra_state"]
         own = {name: extra[name] for name in ("torch_rng", "cuda_rng", "python_rng")}
         pipeline["_extra_state"] = {**extra, "devices": comm.gather_objects(own)}
         return content

@@ -149,7 +149,7 @@ class NrfgsTrainer(Trainer):
             self.optimizers.load_schedulers(content["schedulers"])
         self._follow(training.get("pace"))
         if self.mean is not None and training.get("parameter_mean") is not None:
-            self.mean.load_state(training["parameter_mean"], self.pipeline.model, self.optimizers.optimizers)
+            self.mean.load_state(training["parameter_mean"], self.optimizers.optimizers)
         budget = config.time_budget
         total = f"{self.total_steps:,}" if budget is None else f"as many as fit into {budget:g} minutes"
         CONSOLE.print(f"Going on from {path}, at step {self._start_step} of {total}.", markup=False, soft_wrap=True)
