@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """`statistics.py` in Triton: a kernel for sums and one for maxima."""
 
+from collections.abc import Mapping, Sequence
+
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
+from nrfgs_ns.densification.statistics import Maxima, Step
 from nrfgs_ns.kernels.launch import Launcher
 
 BLOCK = 256
@@ -14,7 +17,7 @@ BLOCK = 256
 
 @triton.jit(do_not_specialize=["count"])
 def add_kernel(
-    sums, counts, largest, rows, gradients, radii, count, scale_x, scale_y, radius_scale,
+    sums, counts, largest, rows, radii, gradients, count, scale_x, scale_y, radius_scale,
     BLOCK: tl.constexpr, RADII: tl.constexpr,
 ):  # fmt: skip
     """Add rows that are all different, but those of radius 0. Without RADII, `largest` is not touched."""
@@ -35,7 +38,7 @@ def add_kernel(
 
 @triton.jit(do_not_specialize=["count"])
 def raise_kernel(
-    widths, errors, changes, rows, radii, gradients, change, count, radius_scale, scale_x, scale_y,
+    widths, errors, changes, rows, radii, gradients, change, count, scale_x, scale_y, radius_scale,
     BLOCK: tl.constexpr, ERRORS: tl.constexpr, CHANGES: tl.constexpr,
 ):  # fmt: skip
     """Raise maxima to rows that are all different, except those of radius 0."""
@@ -59,67 +62,28 @@ launch_add = Launcher(add_kernel)
 launch_raise = Launcher(raise_kernel)
 
 
-def add(
-    sums: Tensor,
-    counts: Tensor,
-    largest: Tensor | None,
-    rows: Tensor,
-    gradients: Tensor,
-    radii: Tensor,
-    scales: tuple[float, float],
-    radius_scale: float,
+def add(state: Mapping[str, Tensor], step: Step, gradients: Tensor) -> None:
+    """`add_in_torch` of float32 tensors, dense, and rows that are all different."""
+    sums, counts, largest = state["grad2d"], state["count"], state.get("radii")
+    _launch(launch_add, (sums, counts, largest), step, (gradients,), RADII=largest is not None)
+
+
+def raise_maxima(maxima: Maxima, step: Step, gradients: Tensor | None, change: Tensor | None) -> None:
+    """`raise_in_torch` of float32 tensors, dense, and rows that are all different."""
+    wanted = {"ERRORS": maxima.errors is not None, "CHANGES": maxima.changes is not None}
+    _launch(launch_raise, maxima, step, (gradients, change), **wanted)
+
+
+def _launch(
+    launch: Launcher, written: Sequence[Tensor | None], step: Step, read: Sequence[Tensor | None], **wanted: bool
 ) -> None:
-    """Add norms of gradients to `sums`, ones to `counts`, and let `largest` be at least the radii.
-
-    Args:
-        sums, counts, largest: [N], float32.
-        rows: of these, all different, int64 [M].
-        gradients: float32 [M, 2], dense.
-        radii: int32 [M].
-        scales, radius_scale: what gradients and radii are multiplied by.
-    """
-    count = len(rows)
+    """Launch a kernel with the tensors that it writes and reads; the first stands for those that it does not touch."""
+    count = len(step.rows)
     if count > 0:
-        launch_add(
-            (-(-count // BLOCK), 1, 1), sums, counts, sums if largest is None else largest, rows, gradients,
-            radii.contiguous(), count, *scales, radius_scale,
-            BLOCK=BLOCK, RADII=largest is not None, num_warps=4,
-        )  # fmt: skip
-        for written in (sums, counts, *(() if largest is None else (largest,))):
-            torch.autograd.graph.increment_version(written)
-
-
-def raise_maxima(
-    widths: Tensor,
-    errors: Tensor | None,
-    changes: Tensor | None,
-    rows: Tensor,
-    radii: Tensor,
-    gradients: Tensor | None,
-    change: Tensor | None,
-    radius_scale: float,
-    scales: tuple[float, float],
-) -> None:
-    """Let the maxima be at least the radii, the norms of the gradients and the changes.
-
-    Args:
-        widths, errors, changes: [N], float32; None with what they are maxima of.
-        rows: of these, all different, int64 [M].
-        radii: int32 [M].
-        gradients: float32 [M, 2], dense.
-        change: float32 [M], dense.
-        radius_scale, scales: factors of radii and gradients.
-    """
-    count = len(rows)
-    if count > 0:
-        none = widths  # stands for what the kernel does not touch
-        launch_raise(
-            (-(-count // BLOCK), 1, 1), widths,
-            none if errors is None else errors, none if changes is None else changes, rows, radii.contiguous(),
-            none if gradients is None else gradients, none if change is None else change,
-            count, radius_scale, *scales,
-            BLOCK=BLOCK, ERRORS=errors is not None, CHANGES=changes is not None, num_warps=4,
-        )  # fmt: skip
-        for written in (widths, errors, changes):
-            if written is not None:
-                torch.autograd.graph.increment_version(written)
+        tensors = *written, step.rows, step.radii.contiguous(), *read
+        tensors = (written[0] if value is None else value for value in tensors)
+        grid, constants = (-(-count // BLOCK), 1, 1), {"BLOCK": BLOCK, **wanted, "num_warps": 4}
+        launch(grid, *tensors, count, *step.scales, 1.0 / step.side, **constants)
+        for value in written:
+            if value is not None:
+                torch.autograd.graph.increment_version(value)
