@@ -70,6 +70,9 @@ class NrfgsTrainerConfig(TrainerConfig):
             if value := getattr(self, name):
                 raise InputError(f"{name} is {value}; these methods train without it. Leave it out.")
         data, positive = self.pipeline.datamanager, math.ulp(0.0)
+        if (order := data.train_cameras_sampling_strategy) != "random":
+            name = "pipeline.datamanager.train_cameras_sampling_strategy"
+            raise InputError(f"{name} is {order}; these methods draw cameras at random. Leave it out.")
         limits = [
             ("time_budget", self.time_budget, positive),
             ("schedule_steps", self.schedule_steps, positive),
