@@ -67,12 +67,8 @@ class ShardedPipeline(NrfgsPipeline):
         return {**result, "splats": sum(self.model.counts)}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore the order of the cameras, and this device's generators if as many devices wrote the checkpoint."""
-        devices = state.get("devices", ())
-        if len(devices) == comm.world():
-            super().set_extra_state({**state, **devices[comm.rank()]})
-        else:
-            self.datamanager.load_sampling_state(state["sampling"])
+        """Restore the order of the cameras; torch's generators differ between devices, and go on as they are."""
+        self.datamanager.load_sampling_state(state["sampling"])
 
 
 class ShardedMean(ParameterMean):
@@ -200,7 +196,7 @@ class ShardedTrainer(NrfgsTrainer):
         return ShardedOptimizers(self.pipeline.model, self.optimizer_configs(), groups, every)
 
     def _checkpoint(self, step: int) -> dict[str, Any]:
-        """The whole, on the main device: what one device would write, and every device's generators and shard."""
+        """The whole, on the main device: what one device would write."""
         content = super()._checkpoint(step)
         model = self.pipeline.model
         model.count()
@@ -208,12 +204,8 @@ class ShardedTrainer(NrfgsTrainer):
         def gathered(table: Tensor) -> Tensor | None:
             return comm.gather_rows(table, model.counts)
 
-        pipeline = content["pipeline"] = map_model_rows(content["pipeline"], gathered, "_model.")
-        pipeline["_model._extra_state"]["shards"] = model.counts
+        content["pipeline"] = map_model_rows(content["pipeline"], gathered, "_model.")
         for name in model.gauss_params:
             content["optimizers"][name] = map_moments(content["optimizers"][name], gathered)
         content["training"].pop("parameter_mean", None)
-        extra = pipeline["_extra_state"]
-        own = {name: extra[name] for name in ("torch_rng", "cuda_rng", "python_rng")}
-        pipeline["_extra_state"] = {**extra, "devices": comm.gather_objects(own)}
         return content

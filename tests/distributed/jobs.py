@@ -15,7 +15,6 @@ AVERAGED = {
     "--average-steps": 10,
     "--steps-per-save": 7,
     "--save-only-latest-checkpoint": False,
-    "--pipeline.model.warmup-steps": 0,
     "--pipeline.model.densification": f"{PEAK},stop_split_at=8",
     "--pipeline.sharding.rebalance-at": 100.0,
 }
