@@ -2,8 +2,7 @@
 """What growth remembers of each step: how much splats wanted to move on the screen, how large they were, and how much
 the view changed their opacity. Growth by gradients adds it up, growth by error keeps the largest.
 
-On CUDA a Triton kernel for sums and one for maxima do it (`statistics_triton.py`), elsewhere and for several cameras
-PyTorch does.
+On CUDA a Triton kernel does it (`statistics_triton.py`), elsewhere and for several cameras PyTorch does.
 """
 
 import math

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`statistics.py` in Triton: a kernel for sums and one for maxima."""
+"""`statistics.py` in a Triton kernel, for sums and for maxima."""
 
 from collections.abc import Mapping, Sequence
 
@@ -16,74 +16,57 @@ BLOCK = 256
 
 
 @triton.jit(do_not_specialize=["count"])
-def add_kernel(
-    sums, counts, largest, rows, radii, gradients, count, scale_x, scale_y, radius_scale,
-    BLOCK: tl.constexpr, RADII: tl.constexpr,
+def take_kernel(
+    widths, norms, others, rows, radii, gradients, change, count, scale_x, scale_y, radius_scale,
+    BLOCK: tl.constexpr, SUMS: tl.constexpr, WIDTHS: tl.constexpr, NORMS: tl.constexpr, OTHERS: tl.constexpr,
 ):  # fmt: skip
-    """Add rows that are all different, but those of radius 0. Without RADII, `largest` is not touched."""
+    """Take rows that are all different, except those of radius 0: SUMS of norms and of ones, or maxima of norms and of
+    changes. Without WIDTHS, NORMS or OTHERS these tables are not touched."""
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     radius = tl.load(radii + at, mask=at < count, other=0).to(tl.float32)
     valid = radius > 0.0
     row = tl.load(rows + at, mask=valid, other=0)
-    x = tl.load(gradients + 2 * at, mask=valid, other=0.0) * scale_x
-    y = tl.load(gradients + 2 * at + 1, mask=valid, other=0.0) * scale_y
-    sum = tl.load(sums + row, mask=valid, other=0.0) + tl.sqrt(x * x + y * y)
-    seen = tl.load(counts + row, mask=valid, other=0.0) + 1.0
-    tl.store(sums + row, sum, mask=valid)
-    tl.store(counts + row, seen, mask=valid)
-    if RADII:
-        share = radius * radius_scale
-        tl.store(largest + row, tl.maximum(tl.load(largest + row, mask=valid, other=0.0), share), mask=valid)
-
-
-@triton.jit(do_not_specialize=["count"])
-def raise_kernel(
-    widths, errors, changes, rows, radii, gradients, change, count, scale_x, scale_y, radius_scale,
-    BLOCK: tl.constexpr, ERRORS: tl.constexpr, CHANGES: tl.constexpr,
-):  # fmt: skip
-    """Raise maxima to rows that are all different, except those of radius 0."""
-    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    radius = tl.load(radii + at, mask=at < count, other=0).to(tl.float32)
-    valid = radius > 0.0
-    row = tl.load(rows + at, mask=valid, other=0)
-    largest = tl.load(widths + row, mask=valid, other=0.0)
-    tl.store(widths + row, tl.maximum(largest, radius * radius_scale), mask=valid)
-    if ERRORS:
+    if WIDTHS:
+        held = tl.load(widths + row, mask=valid, other=0.0)
+        tl.store(widths + row, tl.maximum(held, radius * radius_scale), mask=valid)
+    if NORMS:
         x = tl.load(gradients + 2 * at, mask=valid, other=0.0) * scale_x
         y = tl.load(gradients + 2 * at + 1, mask=valid, other=0.0) * scale_y
-        largest = tl.load(errors + row, mask=valid, other=0.0)
-        tl.store(errors + row, tl.maximum(largest, tl.sqrt(x * x + y * y)), mask=valid)
-    if CHANGES:
-        largest = tl.load(changes + row, mask=valid, other=0.0)
-        tl.store(changes + row, tl.maximum(largest, tl.load(change + at, mask=valid, other=0.0)), mask=valid)
+        norm = tl.sqrt(x * x + y * y)
+        held = tl.load(norms + row, mask=valid, other=0.0)
+        if SUMS:
+            norm += held
+        tl.store(norms + row, tl.maximum(held, norm), mask=valid)
+    if OTHERS:
+        held = tl.load(others + row, mask=valid, other=0.0)
+        other = held + 1.0
+        if not SUMS:
+            other = tl.load(change + at, mask=valid, other=0.0)
+        tl.store(others + row, tl.maximum(held, other), mask=valid)
 
 
-launch_add = Launcher(add_kernel)
-launch_raise = Launcher(raise_kernel)
+launch = Launcher(take_kernel)
 
 
 def add(state: Mapping[str, Tensor], step: Step, gradients: Tensor) -> None:
     """`add_in_torch` of float32 tensors, dense, and rows that are all different."""
-    sums, counts, largest = state["grad2d"], state["count"], state.get("radii")
-    _launch(launch_add, (sums, counts, largest), step, (gradients,), RADII=largest is not None)
+    _take((state.get("radii"), state["grad2d"], state["count"]), step, gradients, None, sums=True)
 
 
 def raise_maxima(maxima: Maxima, step: Step, gradients: Tensor | None, change: Tensor | None) -> None:
     """`raise_in_torch` of float32 tensors, dense, and rows that are all different."""
-    wanted = {"ERRORS": maxima.errors is not None, "CHANGES": maxima.changes is not None}
-    _launch(launch_raise, maxima, step, (gradients, change), **wanted)
+    _take(maxima, step, gradients, change, sums=False)
 
 
-def _launch(
-    launch: Launcher, written: Sequence[Tensor | None], step: Step, read: Sequence[Tensor | None], **wanted: bool
+def _take(
+    tables: Sequence[Tensor | None], step: Step, gradients: Tensor | None, change: Tensor | None, sums: bool
 ) -> None:
-    """Launch a kernel with the tensors that it writes and reads; the first stands for those that it does not touch."""
-    count = len(step.rows)
+    count, written = len(step.rows), [table for table in tables if table is not None]
     if count > 0:
-        tensors = *written, step.rows, step.radii.contiguous(), *read
-        tensors = (written[0] if value is None else value for value in tensors)
-        grid, constants = (-(-count // BLOCK), 1, 1), {"BLOCK": BLOCK, **wanted, "num_warps": 4}
-        launch(grid, *tensors, count, *step.scales, 1.0 / step.side, **constants)
-        for value in written:
-            if value is not None:
-                torch.autograd.graph.increment_version(value)
+        arguments = *tables, step.rows, step.radii.contiguous(), gradients, change
+        arguments = (written[0] if value is None else value for value in arguments)  # which is not touched
+        wanted = dict(zip(("WIDTHS", "NORMS", "OTHERS"), (table is not None for table in tables), strict=True))
+        grid = -(-count // BLOCK), 1, 1
+        launch(grid, *arguments, count, *step.scales, 1 / step.side, BLOCK=BLOCK, SUMS=sums, **wanted, num_warps=4)
+        for table in written:
+            torch.autograd.graph.increment_version(table)
