@@ -101,15 +101,14 @@ def photograph_model(config: Any, datamanager: Any) -> tuple[PhotographModel | N
 
 
 def check_same_photographs(own: PhotographModel | None, written: Mapping[str, Any] | None) -> None:
-    """Raise InputError where a checkpoint, with the entry `written`, learnt other photographs than this training."""
+    """Raise InputError where a checkpoint, with the entry `written`, learnt photographs and this training does not, or
+    the other way round. That the photographs are the same is checked before (`identity.check_scene`)."""
     if (own is None) != (written is None):
         theirs, ours = ("on", "off") if own is None else ("off", "on")
         raise InputError(
             f"The checkpoint was trained with photographs {theirs}, this training has them {ours}. Set "
             f"--pipeline.model.photographs {theirs}, or train anew."
         )
-    if own is not None and own.names != written["names"]:
-        raise InputError("The checkpoint was trained on other photographs. Go on with the same ones, or train anew.")
 
 
 def exif_of(paths: Sequence[Path], stored: Sequence[Exif] | None) -> list[Exif]:
