@@ -55,8 +55,6 @@ class NrfgsModel(ExportedModel):
     """
 
     config: NrfgsModelConfig
-    camera_spacing: float = 0.0
-    """world units between neighbouring training cameras; 0 until a training begins"""
     viewer_panel: Any = None
     """`ViewerPanel` that renders for browsers; None: no viewer"""
     warms_up: bool = True
@@ -289,8 +287,7 @@ class NrfgsModel(ExportedModel):
         cameras = attributes.pipeline.datamanager.train_dataset.cameras
         centers = cameras.camera_to_worlds[:, :3, 3]
         self.densification.begin(centers, self.num_points, int((cameras.width * cameras.height).max()))
-        self.camera_spacing = camera_spacing(centers)
-        self.view_noise = ViewNoise(self.noise_factor * self.camera_spacing, self.view_noise.seed)
+        self.view_noise = ViewNoise(self.noise_factor * camera_spacing(centers), self.view_noise.seed)
 
         steps = len(cameras) if self.config.warmup_steps is None else self.config.warmup_steps
         before, after = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN_ITERATION
