@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from PIL import ExifTags
 
-from nrfgs_ns.data.pictures import read_picture, read_size, share_of_size
+from nrfgs_ns.data.pictures import exif_of, open_picture, read_picture, read_size, tag_number
 from nrfgs_ns.errors import InputError
 from nrfgs_prepare.pairs import Advance, Pairs
 
@@ -95,6 +96,17 @@ def _scale_focal_lengths(database: Path, photos: Path, names: list[str]) -> None
                 params[camera.focal_length_idxs()] *= share
                 camera.params = params
                 opened.update_camera(camera)
+
+
+def share_of_size(path: Path) -> float:
+    """Width of an image over its width in EXIF, to which the sensor's resolution refers; 1 where COLMAP needs or knows
+    neither of them."""
+    with open_picture(path) as image:
+        exif, size = exif_of(image), image.size
+    details = exif.get_ifd(ExifTags.IFD.Exif)
+    sides = [tag_number(details.get(tag)) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
+    needed = ExifTags.Base.FocalPlaneXResolution in details and ExifTags.Base.FocalLengthIn35mmFilm not in details
+    return max(size) / max(sides) if needed and None not in sides else 1.0
 
 
 def largest_features(database: Path, names: list[str], number: int) -> list[np.ndarray]:

@@ -64,6 +64,8 @@ def test_everything_else_is_splatfactos(name):
         "split_screen_size": built.grow_scale2d,
         "cull_scale_thresh": built.prune_scale3d,
         "cull_screen_size": built.prune_scale2d,
+        "stop_screen_size_at": built.refine_scale2d_stop_iter,
+        "use_absgrad": built.absgrad,
     }.items():
         assert number == getattr(host.pipeline.model, option)
         left_out.add(option)

@@ -115,27 +115,18 @@ def sh_bases(degree: int, directions: Tensor) -> Tensor:
 
 
 def eval_sh(degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
-    """Sum of harmonics up to `degree`, [M, 3]: on CUDA by `harmonics_triton.py`, or by gsplat without Triton.
+    """Sum of harmonics up to `degree`, [M, 3]: on CUDA by `harmonics_triton.py`, if Triton runs.
 
     Args:
         degree: highest degree used; coefficients beyond it are ignored.
         directions: [M, 3], any length but zero.
         coefficients: [M, B, 3] with B >= (degree + 1)^2.
-
-    Raises:
-        RuntimeError: a CUDA graph is being recorded, which misses gsplat's kernel, and Triton does not run.
     """
-    if directions.is_cuda:
-        float32 = directions.dtype == coefficients.dtype == torch.float32
-        if float32 and degree <= 3 and kernels_run_on(directions.device):
-            from nrfgs_ns.appearance.harmonics_triton import Harmonics
+    float32 = directions.dtype == coefficients.dtype == torch.float32
+    if directions.is_cuda and float32 and kernels_run_on(directions.device):
+        from nrfgs_ns.appearance.harmonics_triton import Harmonics
 
-            return Harmonics.apply(degree, directions, coefficients)
-        if torch.cuda.is_current_stream_capturing():
-            raise RuntimeError("gsplat's spherical harmonics cannot be recorded")
-        from gsplat import spherical_harmonics  # its kernels are compiled at the first call
-
-        return spherical_harmonics(degree, directions, coefficients)
+        return Harmonics.apply(degree, directions, coefficients)
     bases = sh_bases(degree, torch.nn.functional.normalize(directions, dim=-1))
     return torch.einsum("mb,mbc->mc", bases, coefficients[:, : num_bases(degree)])
 

@@ -4,7 +4,6 @@ without an accelerator, and to continue after an interruption."""
 
 import hashlib
 import json
-import random
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -224,36 +223,20 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         return images
 
     def sampling_state(self) -> dict[str, Any]:
-        """State of the order of training cameras, of plain numbers, strings, lists and tuples; nerfstudio draws from
-        numpy's global generator for the strategy `fps`."""
-        state = {
-            "strategy": self.config.train_cameras_sampling_strategy,
-            "num_images": len(self.train_dataset),
-            "unseen_cameras": list(self.train_unseen_cameras),
-        }
-        if state["strategy"] == "random":
-            return state | {"generator": self.random_generator.getstate()}
-        name, keys, *rest = np.random.get_state()
-        epochs = self.train_unsampled_epoch_count.tolist()
-        return state | {"generator": (name, keys.tolist(), *rest), "epochs_unsampled": epochs}
+        """State of the order of training cameras, of plain numbers, lists and tuples."""
+        unseen, generator = list(self.train_unseen_cameras), self.random_generator.getstate()
+        return {"num_images": len(self.train_dataset), "unseen_cameras": unseen, "generator": generator}
 
     def load_sampling_state(self, state: dict[str, Any]) -> None:
-        """Continue the order of cameras from `sampling_state()`; InputError if images or strategy are others."""
-        now = self.sampling_state()
-        if (state["num_images"], state["strategy"]) != (now["num_images"], now["strategy"]):
+        """Continue the order of cameras from `sampling_state()`; InputError if the number of images is another."""
+        if state["num_images"] != len(self.train_dataset):
             raise InputError(
-                f"{self.get_datapath()}: the checkpoint was trained on {state['num_images']} images with "
-                f"train_cameras_sampling_strategy {state['strategy']}, but now these are {now['num_images']} and "
-                f"{now['strategy']}. Continue with the same images, split and strategy, or train anew."
+                f"{self.get_datapath()}: the checkpoint was trained on {state['num_images']} images, but now these are "
+                f"{len(self.train_dataset)}. Continue with the same images and split, or train anew."
             )
         self.train_unseen_cameras = list(state["unseen_cameras"])
-        if state["strategy"] == "random":
-            version, words, gauss = state["generator"]
-            self.random_generator = random.Random()
-            self.random_generator.setstate((version, tuple(words), gauss))
-        else:
-            np.random.set_state(tuple(state["generator"]))
-            self.train_unsampled_epoch_count = np.array(state["epochs_unsampled"])
+        version, words, gauss = state["generator"]
+        self.random_generator.setstate((version, tuple(words), gauss))
 
 
 def _shows_anything(data: dict[str, Any]) -> bool:

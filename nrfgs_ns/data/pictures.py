@@ -151,9 +151,13 @@ NUMBERS = {
 def read_exif(path: Path) -> dict[str, float | str]:
     """A photograph's EXIF, as far as known: exposure_time (seconds), f_number, iso, focal_length (mm), each finite and
     above 0, and model. Empty for a file that is not an image."""
-    exif, _ = _exif_at(path)
+    try:
+        with open_picture(path) as image:
+            exif = exif_of(image)
+    except InputError:
+        return {}
     details = exif.get_ifd(ExifTags.IFD.Exif)
-    values = {name: _number(details.get(tag)) for name, tag in NUMBERS.items()}
+    values = {name: tag_number(details.get(tag)) for name, tag in NUMBERS.items()}
     values["model"] = str(exif.get(ExifTags.Base.Model) or "").strip(" \0")
     return {name: value for name, value in values.items() if value}
 
@@ -182,29 +186,10 @@ def exif_of(image: Image.Image) -> Image.Exif:
         return Image.Exif()
 
 
-def _exif_at(path: Path) -> tuple[Image.Exif, tuple[int, int]]:
-    """EXIF and size of a file; empty if it is not an image."""
-    try:
-        with open_picture(path) as image:
-            return exif_of(image), image.size
-    except InputError:
-        return Image.Exif(), (0, 0)
-
-
-def _number(value: Any) -> float | None:
+def tag_number(value: Any) -> float | None:
     """A tag's (first) value if it is a finite number above 0."""
     try:
         number = float(value[0] if isinstance(value, tuple) else value)
     except (TypeError, ValueError, IndexError, ZeroDivisionError):
         return None
     return number if math.isfinite(number) and number > 0 else None
-
-
-def share_of_size(path: Path) -> float:
-    """Width of an image over its width in EXIF, to which the sensor's resolution refers; 1 where COLMAP needs or knows
-    neither of them."""
-    exif, size = _exif_at(path)
-    details = exif.get_ifd(ExifTags.IFD.Exif)
-    sides = [_number(details.get(tag)) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
-    needed = ExifTags.Base.FocalPlaneXResolution in details and ExifTags.Base.FocalLengthIn35mmFilm not in details
-    return max(size) / max(sides) if needed and None not in sides else 1.0

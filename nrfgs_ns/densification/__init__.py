@@ -53,11 +53,10 @@ def strategy_from(text: str) -> DensificationConfig:
 
 def _value(option: str, kind: Any, text: str) -> Any:
     """A value of this type."""
-    if kind is bool or get_origin(kind) is Literal:
-        choices = {str(value).lower(): value for value in ((True, False) if kind is bool else get_args(kind))}
-        if text.lower() in choices:
-            return choices[text.lower()]
-        raise InputError(f"{option} is {text!r}; use one of {', '.join(choices)}.")
+    if get_origin(kind) is Literal:
+        if text in get_args(kind):
+            return text
+        raise InputError(f"{option} is {text!r}; use one of {', '.join(get_args(kind))}.")
     try:
         return kind(text)
     except ValueError:

@@ -29,7 +29,7 @@ from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 from torch.nn import Parameter
 
-from nrfgs_ns.densification.statistics import take_maxima
+from nrfgs_ns.densification.statistics import Maxima, take_maxima
 from nrfgs_ns.densification.strategy import (
     CHANGE,
     CHANGE_BEFORE,
@@ -142,15 +142,9 @@ class ErrorGuidedDensification(Densification):
             if self.state[name] is None:
                 empty = UNSEEN if name in (CHANGE, CHANGE_BEFORE) else 0.0
                 self.state[name] = torch.full((count,), empty, device=info["radii"].device)
-        grows = step < self.grow_until
-        take_maxima(
-            self.state[WIDTH],
-            self.state[ERROR] if grows else None,
-            self.state.get(CHANGE),
-            info,
-            info["means2d"].absgrad if grows else None,
-            info.get("change"),
-        )
+        error, gradients = (self.state[ERROR], info["means2d"].absgrad) if step < self.grow_until else (None, None)
+        maxima = Maxima(self.state[WIDTH], error, self.state.get(CHANGE))
+        take_maxima(maxima, info, gradients, info.get("change"))
 
     # What a refinement does.
 

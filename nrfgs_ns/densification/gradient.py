@@ -62,13 +62,10 @@ class Splatfacto(GradientConfig):
 
     name: ClassVar[str] = "splatfacto"
     densify_grad_thresh: float = 0.0008
-    """mean gradient of the loss by the screen position (in [-1, 1]) above which splats grow"""
-    use_absgrad: bool = True
-    """sum the gradients' absolute values over pixels (AbsGS)"""
+    """mean gradient of the loss by the screen position (in [-1, 1]) above which splats grow; its absolute values are
+    summed over pixels (AbsGS)"""
     cull_alpha_thresh: float = 0.1
     """opacity below which splats are pruned; a reset lowers opacities to twice this"""
-    stop_screen_size_at: int = 4000
-    """step after which sizes in the image do not count"""
 
     def check(self) -> None:
         super().check()
@@ -84,9 +81,9 @@ class Splatfacto(GradientConfig):
             prune_scale3d=0.5,
             grow_scale2d=0.05,  # shares of the image
             prune_scale2d=0.15,
-            refine_scale2d_stop_iter=self.stop_screen_size_at,
+            refine_scale2d_stop_iter=4000,
             pause_refine_after_reset=num_images + self.refine_every,
-            absgrad=self.use_absgrad,
+            absgrad=True,
         )
 
 

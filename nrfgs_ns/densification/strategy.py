@@ -122,7 +122,6 @@ class DensificationConfig(ABC):
             value = getattr(self, field.name)
             if isinstance(value, (int, float)):
                 self.require(0 <= value < math.inf, field.name, "zero or positive")
-        self.require(self.opacity_seen in ("base", "peak"), "opacity_seen", "base or peak")
         self.require(self.refine_every >= 1, "refine_every", "at least 1")
 
     def require(self, holds: bool, name: str, needed: str) -> None:

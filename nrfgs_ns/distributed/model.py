@@ -33,6 +33,7 @@ class ShardedModel(NrfgsModel):
     renders, computes losses or refines must be called on all devices, in the same order.
     """
 
+    warms_up = False
     counts: list[int]
     """every device's splats, [W]"""
     loaded: slice | None = None
@@ -116,19 +117,6 @@ class ShardedModel(NrfgsModel):
 
     # Training.
 
-    def far_from_neutral(self, camera, weights):
-        """As for one device: the mean over all visible splats, on whichever device."""
-        mine = super().far_from_neutral(camera, weights)
-        if mine is None:
-            return None
-        visible, loss, gradients = mine
-        if visible == 0:  # means over nothing are NaN
-            loss, gradients = torch.zeros_like(loss), [torch.zeros_like(gradient) for gradient in gradients]
-        sums = [loss.new_tensor(float(visible)), *(visible * part for part in (loss, *gradients))]
-        comm.sum_over_devices(sums)
-        total, loss, *gradients = sums
-        return int(total), loss / total, tuple(gradient / total for gradient in gradients)
-
     def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
         """This device's losses, whose gradients are divided by W: summed over devices they are the mean loss's.
 
@@ -202,9 +190,7 @@ class ShardedModel(NrfgsModel):
     def load_state_dict(self, state: dict[str, Any], strict: bool = True, **kwargs):
         """Load this device's rows of a whole checkpoint. See `NrfgsModel.load_state_dict`."""
         total, devices = len(state["gauss_params.means"]), comm.world()
-        written = state.get("_extra_state", {}).get("shards")
-        self.loaded = rows_of(comm.rank(), total, devices, written)
-        known = written is not None and len(written) == devices and sum(written) == total
-        self.counts = list(written) if known else shard_counts(total, devices)
+        self.loaded = rows_of(comm.rank(), total, devices)
+        self.counts = shard_counts(total, devices)
         mine = map_model_rows(state, lambda table: table[self.loaded])
         return super().load_state_dict(mine, strict=strict, **kwargs)

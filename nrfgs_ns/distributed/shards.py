@@ -26,18 +26,9 @@ def shard_counts(total: int, devices: int) -> list[int]:
     return [len(range(rank, total, devices)) for rank in range(devices)]
 
 
-def rows_of(rank: int, total: int, devices: int, written: list[int] | None = None) -> slice:
-    """Which rows of a whole table are a device's.
-
-    They are dealt out in turn, because neighbours in a point cloud are neighbours in space, and each camera should see
-    equally many splats of each device. A checkpoint that as many devices wrote is cut where it was put together, so
-    that the training resumes exactly.
-
-    Args:
-        written: rows of each device that wrote the table, if known.
-    """
-    if written is not None and len(written) == devices and sum(written) == total:
-        return slice(sum(written[:rank]), sum(written[: rank + 1]))
+def rows_of(rank: int, total: int, devices: int) -> slice:
+    """Which rows of a whole table are a device's. They are dealt out in turn, because neighbours in a point cloud are
+    neighbours in space, and each camera should see equally many splats of each device."""
     return slice(rank, total, devices)
 
 

@@ -67,48 +67,21 @@ class ShardedPipeline(NrfgsPipeline):
         return {**result, "splats": sum(self.model.counts)}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore the order of the cameras, and this device's generators if as many devices wrote the checkpoint."""
-        devices = state.get("devices", ())
-        if len(devices) == comm.world():
-            super().set_extra_state({**state, **devices[comm.rank()]})
-        else:
-            self.datamanager.load_sampling_state(state["sampling"])
+        """Restore the order of the cameras; torch's generators differ between devices, and go on as they are."""
+        self.datamanager.load_sampling_state(state["sampling"])
 
 
 class ShardedMean(ParameterMean):
     """`ParameterMean` of one device's splats and of the shared weights. If one device must restart, all do, so that
-    shared weights stay the same. All methods except `install` and `state` must be called on all devices."""
+    shared weights stay the same. It is in no checkpoint: a training that goes on averages its own steps."""
 
     def is_current(self, optimizers: Mapping[str, Optimizer]) -> bool:
         """Whether the rows of all devices still denote the splats that were averaged. The host waits for the answer."""
         here = super().is_current(optimizers)
         return all(comm.gather_counts(int(here), parameters_of(next(iter(optimizers.values())))[0].device))
 
-    def whole_state(self, model, optimizers: Mapping[str, Optimizer]) -> dict[str, Any]:
-        """A checkpoint's "parameter_mean", with the splats' rows of all devices on the main one, and None elsewhere; {}
-        where the guard has removed splats of any device since. `model` is a ShardedModel whose splats are counted."""
-        if not self.is_current(optimizers):
-            return {}
-        state = self.state()
-        for name, mean in state["means"].items():
-            if _is_per_splat(name, model):
-                state["means"][name] = comm.gather_rows(mean, model.counts)
-        return {"parameter_mean": state}
-
-    def load_state(self, state: Mapping[str, Any], model, optimizers: Mapping[str, Optimizer]) -> None:
-        """Go on from this device's rows of a whole checkpoint's `state`; see `ParameterMean.load_state`."""
-        means, total = dict(state["means"]), sum(model.counts)
-        for name, mean in means.items():
-            if _is_per_splat(name, model):
-                if len(mean) != total:  # its rows could fit one device and not another
-                    return
-                means[name] = mean[model.loaded].contiguous()
-        super().load_state({**state, "means": means}, model, optimizers)
-
-
-def _is_per_splat(name: str, model) -> bool:
-    """Whether a parameter, by its group and its place in it, has a row for each splat."""
-    return name.rpartition(".")[0] in model.gauss_params
+    def load_state(self, state: Mapping[str, Any], optimizers: Mapping[str, Optimizer]) -> None:
+        """Leave the mean of a checkpoint of one device alone."""
 
 
 class ShardedGuard(Guard):
@@ -223,7 +196,7 @@ class ShardedTrainer(NrfgsTrainer):
         return ShardedOptimizers(self.pipeline.model, self.optimizer_configs(), groups, every)
 
     def _checkpoint(self, step: int) -> dict[str, Any]:
-        """The whole, on the main device: what one device would write, and every device's generators and shard."""
+        """The whole, on the main device: what one device would write."""
         content = super()._checkpoint(step)
         model = self.pipeline.model
         model.count()
@@ -231,13 +204,8 @@ class ShardedTrainer(NrfgsTrainer):
         def gathered(table: Tensor) -> Tensor | None:
             return comm.gather_rows(table, model.counts)
 
-        pipeline = content["pipeline"] = map_model_rows(content["pipeline"], gathered, "_model.")
-        pipeline["_model._extra_state"]["shards"] = model.counts
+        content["pipeline"] = map_model_rows(content["pipeline"], gathered, "_model.")
         for name in model.gauss_params:
             content["optimizers"][name] = map_moments(content["optimizers"][name], gathered)
-        training, extra = content["training"], pipeline["_extra_state"]
-        if training.pop("parameter_mean", None) is not None:  # on all devices, or on none
-            training |= self.mean.whole_state(model, self.optimizers.optimizers)
-        own = {name: extra[name] for name in ("torch_rng", "cuda_rng", "python_rng")}
-        pipeline["_extra_state"] = {**extra, "devices": comm.gather_objects(own)}
+        content["training"].pop("parameter_mean", None)
         return content

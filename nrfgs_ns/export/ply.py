@@ -50,8 +50,7 @@ WORTH_A_WORD = 0.1
 def export_ply(load_config: Path, output: Path, options: PlyOptions, measure: bool, report_file: Path | None) -> None:
     """Write a PLY file, and report what it costs; see `nrfgs export ply --help`."""
     with few_threads() as threads:
-        # Set up exactly as in ns-export, so that both fit over the same cameras.
-        pipeline = load_model(load_config, "inference")
+        pipeline = load_model(load_config, "test")
         threads.suit_to(pipeline)
         pipeline.model.fit_on(pipeline.datamanager.train_dataset.cameras, options.steps)
         begin = perf_counter()
@@ -77,7 +76,6 @@ def export_ply(load_config: Path, output: Path, options: PlyOptions, measure: bo
         if origin.any():
             report["origin"] = origin.tolist()
         if measure:
-            pipeline = load_model(load_config, "test")
             report |= measure_loss(pipeline, pictures_of_file(pipeline.model, output, placed))
     finish(summary(output, report), report, report_file)
 

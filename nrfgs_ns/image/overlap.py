@@ -180,22 +180,15 @@ def varies(known: Tensor) -> bool:
     return spread(known) >= ENOUGH_KNOWN_STOPS
 
 
-def slope(pairs: Pairs, known: Tensor) -> tuple[float, float | None]:
-    """Regression of the photographs' brightness on their known exposures (stops, NaN where unknown, [V]).
-
-    Returns:
-        Stops of brightness for a stop of known exposure, and the share of the shifts' squares that this explains, both
-        0 to 1; (1, None) if there are too few pairs.
-    """
+def slope(pairs: Pairs, known: Tensor) -> float:
+    """Stops of brightness for a stop of known exposure (stops, NaN where unknown, [V]), by regression over the pairs, 0
+    to 1; 1 if there are too few of them."""
     expected = known[pairs.second] - known[pairs.first]
     both = torch.isfinite(expected) & (expected.abs() > 0)
     expected, seen = expected[both].double(), pairs.shift[both, 0].double()
     if len(seen) < 3:
-        return 1.0, None
-    factor = float((expected * seen).sum() / expected.square().sum())
-    factor = min(max(factor, 0.0), 1.0)
-    squares, left = float(seen.square().sum()), float((seen - factor * expected).square().sum())
-    return factor, max(1.0 - left / squares, 0.0) if squares > 0.0 else 0.0
+        return 1.0
+    return min(max(float((expected * seen).sum() / expected.square().sum()), 0.0), 1.0)
 
 
 class Looks(NamedTuple):
@@ -225,7 +218,7 @@ def estimate(pairs: Pairs, known: Tensor, centers: Tensor) -> Looks:
     expected = torch.zeros(count, 3, dtype=torch.float64)
     there = torch.isfinite(known)
     if there.any():
-        factor, _ = slope(pairs, known)
+        factor = slope(pairs, known)
         expected[there, 0] = factor * (known[there] - known[there].mean()).double()
     usual, random, places = USUAL_STOPS, [0.0, 0.0, 0.0], None
     if count > MOST_PHOTOGRAPHS:

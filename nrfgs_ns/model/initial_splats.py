@@ -58,20 +58,17 @@ def mean_distance(means: Tensor) -> Tensor:
     return torch.from_numpy(distances[:, 1:]).float().mean(dim=-1, keepdim=True)
 
 
-def start_with_dense_points(model: Any, datamanager: Any) -> list[str]:
+def start_with_dense_points(model: Any, datamanager: Any) -> None:
     """Let a model that has not been trained start with more points.
 
     Args:
         model: an NrfgsModel.
         datamanager: with its images read.
-
-    Returns:
-        How many points, in words; nothing where there are no others than the capture's.
     """
     config, own = model.config, model.seed_points
     share = share_kept(model.num_views) if config.dense_start == "auto" and not config.random_init else 0.0
     if share == 0 or own is None:
-        return []
+        return
     cameras, images = datamanager.train_dataset.cameras.to(model.device), datamanager.cached_train
     poses = world_to_camera(cameras.camera_to_worlds)
     intrinsics = cameras.get_intrinsics_matrices().to(poses)  # nerfstudio makes them on the CPU
@@ -80,4 +77,3 @@ def start_with_dense_points(model: Any, datamanager: Any) -> list[str]:
     progress = partial(track, description="Points from photographs", console=CONSOLE, transient=True)
     xyz, rgb = dense_points(views, own[0].to(poses), share, progress)
     model.start_from((torch.cat([own[0], xyz.to(own[0])]), torch.cat([own[1], (255 * rgb).to(own[1])])))
-    return [f"start: {len(own[0]):,} points of the capture, {len(xyz):,} from the photographs"]

@@ -55,10 +55,10 @@ class NrfgsModel(ExportedModel):
     """
 
     config: NrfgsModelConfig
-    camera_spacing: float = 0.0
-    """world units between neighbouring training cameras; 0 until a training begins"""
     viewer_panel: Any = None
     """`ViewerPanel` that renders for browsers; None: no viewer"""
+    warms_up: bool = True
+    """whether the warm-up sees all splats"""
     _scheduled: int | None = None
 
     def populate_modules(self):
@@ -287,8 +287,7 @@ class NrfgsModel(ExportedModel):
         cameras = attributes.pipeline.datamanager.train_dataset.cameras
         centers = cameras.camera_to_worlds[:, :3, 3]
         self.densification.begin(centers, self.num_points, int((cameras.width * cameras.height).max()))
-        self.camera_spacing = camera_spacing(centers)
-        self.view_noise = ViewNoise(self.noise_factor * self.camera_spacing, self.view_noise.seed)
+        self.view_noise = ViewNoise(self.noise_factor * camera_spacing(centers), self.view_noise.seed)
 
         steps = len(cameras) if self.config.warmup_steps is None else self.config.warmup_steps
         before, after = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN_ITERATION
@@ -299,25 +298,6 @@ class NrfgsModel(ExportedModel):
         if self.photograph is not None:
             callbacks.append(TrainingCallback([after], lambda step: self.photograph.center_()))
         return callbacks
-
-    def far_from_neutral(
-        self, camera: Cameras, weights: list[Parameter]
-    ) -> tuple[int, Tensor, tuple[Tensor, ...]] | None:
-        """The head's neutral loss for one camera, for the warm-up.
-
-        Args:
-            weights: the head's shared weights.
-
-        Returns:
-            The number of visible splats; the loss, NaN without any; its gradients by the weights. None for a head
-            without such a loss.
-        """
-        with torch.no_grad():
-            view = self.project(camera)
-        loss = self.head.neutral_loss(self.field.splats, view.visible, view.center)
-        if loss is None:
-            return None
-        return len(view.visible), loss.detach(), torch.autograd.grad(loss, weights)
 
     def step_cb(self, optimizers, step: int) -> None:
         super().step_cb(optimizers, step)

@@ -9,6 +9,8 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from nrfgs_ns.errors import InputError
+
 LEARNING_RATE = 1e-3
 
 
@@ -19,6 +21,9 @@ def warm_up(model, cameras: Cameras, steps: int) -> None:
         model: an NrfgsModel in training mode.
         cameras: the training cameras, [V]; step i looks through camera i mod V.
         steps: number of steps, >= 0.
+
+    Raises:
+        InputError: there is something to learn, and the model has one of several devices' splats alone.
     """
     weights = list(model.head.parameters())
     if not weights:
@@ -27,16 +32,20 @@ def warm_up(model, cameras: Cameras, steps: int) -> None:
     residuals = []  # root mean square in each step
     for step in range(steps):
         index = step % len(cameras)
-        neutral = model.far_from_neutral(cameras[index : index + 1].to(model.device), weights)
-        if neutral is None:
+        with torch.no_grad():
+            view = model.project(cameras[index : index + 1].to(model.device))
+        loss = model.head.neutral_loss(model.field.splats, view.visible, view.center)
+        if loss is None:
             return
-        visible, loss, gradients = neutral
-        if visible == 0:
+        if len(view.visible) == 0:
             continue
         residuals.append(loss.item() ** 0.5)
         if residuals[-1] == 0.0:  # the head adds nothing from the start
             return
-        for weight, gradient in zip(weights, gradients, strict=True):
+        if not model.warms_up:
+            fix = "Use one, or --pipeline.model.warmup-steps 0."
+            raise InputError(f"The head starts with a residual, and is warmed up on one device only. {fix}")
+        for weight, gradient in zip(weights, torch.autograd.grad(loss, weights), strict=True):
             weight.grad = gradient
         optimizer.step()
     optimizer.zero_grad(set_to_none=True)

@@ -62,7 +62,7 @@ class ParameterMean:
         """The checkpoint's entry: numbers and tensors."""
         return {"count": self.count, "means": dict(self._means)}
 
-    def load_state(self, state: Mapping[str, Any], model, optimizers: Mapping[str, Optimizer]) -> None:
+    def load_state(self, state: Mapping[str, Any], optimizers: Mapping[str, Optimizer]) -> None:
         """Go on from the `state` of a checkpoint whose parameters have been loaded; other shapes are ignored."""
         parameters = _parameters(optimizers)
         shapes = {name: parameter.shape for name, parameter in parameters.items()}

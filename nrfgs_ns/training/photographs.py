@@ -45,39 +45,19 @@ class Evidence(NamedTuple):
         own tone curve makes up for does not show.
         """
         vary = any(size >= enough for size, enough in zip(self.seen.random, ENOUGH_STOPS, strict=True))
-        followed, _ = slope(self.pairs, self.exif)
-        return vary or varies(self.exif) and followed * spread(self.exif) >= ENOUGH_STOPS[0]
-
-    @property
-    def numbers(self) -> str:
-        """The evidence in words and numbers."""
-        exposures, *colors = self.seen.random
-        text = f"exposure varies by {exposures:.2f} stops, colour by {max(colors):.2f}"
-        if not any(self.seen.random):
-            text = "photographs have too few points in common to compare them"
-        text += f" (learnt from {ENOUGH_STOPS[0]:g}, or {ENOUGH_STOPS[1]:g} in colour); EXIF: "
-        if not torch.isfinite(self.exif).any():
-            return text + "no exposures"
-        text += f"exposure varies by {spread(self.exif):.2f} stops"
-        _, explained = slope(self.pairs, self.exif)
-        if varies(self.exif) and explained is not None:
-            text += f", which explains {explained:.0%} of the difference"
-        return text
+        return vary or varies(self.exif) and slope(self.pairs, self.exif) * spread(self.exif) >= ENOUGH_STOPS[0]
 
 
-def photograph_model(config: Any, datamanager: Any) -> tuple[PhotographModel | None, list[str]]:
-    """The photographs' exposure model, announced in one line.
+def photograph_model(config: Any, datamanager: Any) -> PhotographModel | None:
+    """The photographs' exposure model, announced in one line; None where nothing is learnt.
 
     Args:
         config: an NrfgsModelConfig.
         datamanager: with its images read.
-
-    Returns:
-        The model, None where nothing is learnt; and the evidence in words and numbers.
     """
     choice = config.photographs
     if choice == "off":
-        return None, []
+        return None
     dataset, metadata = datamanager.train_dataset, datamanager.train_dataparser_outputs.metadata
     exif = torch.tensor([exposure(entry) for entry in exif_of(dataset.image_filenames, metadata.get("exif"))])
     pairs = compare_photographs(metadata.get("points3D_xyz"), dataset.cameras, datamanager.cached_train)
@@ -92,24 +72,22 @@ def photograph_model(config: Any, datamanager: Any) -> tuple[PhotographModel | N
     else:
         reason = f"since {'the photographs agree' if any(known.seen.random) else 'too few common points compare them'}"
     CONSOLE.print(f"Photographs: {outcome}, {reason}.", soft_wrap=True)
-    notes = [f"photographs: {outcome}: {known.numbers}"]
     if not wanted:
-        return None, notes
+        return None
     looks = estimate(pairs, exif, centers) if torch.isfinite(exif).any() else known.seen
     names = [path.name for path in dataset.image_filenames]
-    return PhotographModel(names, looks.stops, looks.held), notes
+    return PhotographModel(names, looks.stops, looks.held)
 
 
 def check_same_photographs(own: PhotographModel | None, written: Mapping[str, Any] | None) -> None:
-    """Raise InputError where a checkpoint, with the entry `written`, learnt other photographs than this training."""
+    """Raise InputError where a checkpoint, with the entry `written`, learnt photographs and this training does not, or
+    the other way round. That the photographs are the same is checked before (`identity.check_scene`)."""
     if (own is None) != (written is None):
         theirs, ours = ("on", "off") if own is None else ("off", "on")
         raise InputError(
             f"The checkpoint was trained with photographs {theirs}, this training has them {ours}. Set "
             f"--pipeline.model.photographs {theirs}, or train anew."
         )
-    if own is not None and own.names != written["names"]:
-        raise InputError("The checkpoint was trained on other photographs. Go on with the same ones, or train anew.")
 
 
 def exif_of(paths: Sequence[Path], stored: Sequence[Exif] | None) -> list[Exif]:

@@ -70,8 +70,6 @@ class NrfgsPipeline(VanillaPipeline):
     evaluates to null where a metric is undefined, and resumes exactly from its checkpoints."""
 
     config: NrfgsPipelineConfig
-    notes: tuple[str, ...] | list[str] = ()
-    """numbers behind what was chosen automatically, in sentences"""
     steps_per_log: int = 1
     """steps between two evaluations of the training's metrics"""
 
@@ -90,7 +88,7 @@ class NrfgsPipeline(VanillaPipeline):
             with tried_meanwhile(trials, self.model.device):
                 self._check_smallest_image()
                 self.datamanager.load_all_images()
-                photographs, self.notes = photograph_model(config.model, self.datamanager)
+                photographs = photograph_model(config.model, self.datamanager)
             self.model.learn_photographs(photographs)
         if test_mode == "inference":  # ns-export (and ns-render, which asks for no harmonics)
             self.model.fit_on(self.datamanager.train_dataset.cameras)

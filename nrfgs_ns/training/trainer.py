@@ -101,9 +101,8 @@ class NrfgsTrainer(Trainer):
     def start_densely(self) -> None:
         """Add points from the photographs to those that a new training starts from."""
         if self.config.load_dir is None and self.config.load_checkpoint is None:
-            notes = start_with_dense_points(self.pipeline.model, self.pipeline.datamanager)
+            start_with_dense_points(self.pipeline.model, self.pipeline.datamanager)
             torch.cuda.empty_cache()  # what a training holds tells how far it may grow; nothing without CUDA
-            self.pipeline.notes = [*self.pipeline.notes, *notes]
 
     def setup_optimizers(self) -> Optimizers:
         """The optimisers, once what depends on the views is known: the steps, the points to start from, the pace."""
@@ -149,7 +148,7 @@ class NrfgsTrainer(Trainer):
             self.optimizers.load_schedulers(content["schedulers"])
         self._follow(training.get("pace"))
         if self.mean is not None and training.get("parameter_mean") is not None:
-            self.mean.load_state(training["parameter_mean"], self.pipeline.model, self.optimizers.optimizers)
+            self.mean.load_state(training["parameter_mean"], self.optimizers.optimizers)
         budget = config.time_budget
         total = f"{self.total_steps:,}" if budget is None else f"as many as fit into {budget:g} minutes"
         CONSOLE.print(f"Going on from {path}, at step {self._start_step} of {total}.", markup=False, soft_wrap=True)

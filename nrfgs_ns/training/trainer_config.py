@@ -17,7 +17,7 @@ from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.errors import DEBUG, InputError
 from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.config_file import check_types
-from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS, STEPS_PER_VIEW, Pace, TimedPace, resolution_phases, steps_for
+from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS, Pace, TimedPace, resolution_phases, steps_for
 
 TRAINER = "nrfgs_ns.training.trainer:NrfgsTrainer"
 SEVERAL_DEVICES = "nrfgs_ns.distributed"
@@ -32,8 +32,6 @@ FEW = 0.9
 """Trust in view dependence below which its reduction is reported on the terminal: 180 training views."""
 PLAIN = {"markup": False, "highlight": False, "soft_wrap": True}
 """Text for the console that may hold brackets and paths."""
-NOTES = "choices.txt"
-"""File in a training's folder: the numbers behind what was chosen automatically."""
 
 
 @dataclass
@@ -70,6 +68,9 @@ class NrfgsTrainerConfig(TrainerConfig):
             if value := getattr(self, name):
                 raise InputError(f"{name} is {value}; these methods train without it. Leave it out.")
         data, positive = self.pipeline.datamanager, math.ulp(0.0)
+        if (order := data.train_cameras_sampling_strategy) != "random":
+            name = "pipeline.datamanager.train_cameras_sampling_strategy"
+            raise InputError(f"{name} is {order}; these methods draw cameras at random. Leave it out.")
         limits = [
             ("time_budget", self.time_budget, positive),
             ("schedule_steps", self.schedule_steps, positive),
@@ -169,23 +170,11 @@ def _absolute(path: Path | None) -> Path | None:
 
 
 def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool) -> None:
-    """Say what was chosen automatically, and write the numbers behind it to `NOTES`."""
+    """Say what was chosen automatically."""
     model = pipeline.model
-    views, given, suited, unit = model.num_views, model.num_train_data, model.suited_head, model.scene_unit
+    views, given = model.num_views, model.num_train_data
     parts = [f"{steps_for(views):,} steps"] if steps_are_chosen else []
-    parts += ["view dependence reduced, as suits few views"] if model.trust < FEW else []
-    rounded = (f"{name} {round(value, 3) if isinstance(value, float) else value}" for name, value in suited.items())
-    offset, near = model.noise_factor * model.camera_spacing / unit, model.near / unit
-    noise = f"about {offset:.2g} scene units, {model.noise_factor:.2g} times the distance between neighbouring cameras"
-    has_near_plane = model.config.near_plane == "auto" and model.near > 0.0
-    chosen = (
-        (steps_are_chosen, f"steps: {STEPS_PER_VIEW} a view, at least {FEWEST_STEPS:,} and at most {STEPS:,}"),
-        (model.trust < 1.0, f"trust in view dependence: {model.trust:.2g} of 1"),
-        (suited, f"head, by views and densification: {', '.join(rounded)}"),
-        (model.view_noise.sigma > 0.0, f"noise on the camera centre in training: {noise}"),
-        (has_near_plane, f"near plane: {near:.2g} scene units, half the depth of the nearest points"),
-    )
-    notes = [*pipeline.notes, *(note for holds, note in chosen if holds)]
+    parts += [f"view dependence reduced to {model.trust:.2g}, as suits few views"] if model.trust < FEW else []
     words = f"{given} training view{'s' * (given != 1)}"
     count = words if views == given else f"{views} different training views of {given}"
     if parts:
@@ -200,6 +189,3 @@ def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool)
         scale = min(1.0, LONGEST_SIDE / max(width, height))
         words = f"nrfgs-fast, --time-budget 10 and --pipeline.datamanager.camera-res-scale-factor {scale:.2g}"
         CONSOLE.print(f"No CUDA device: the CPU trains. A result in ten minutes: {words}", **PLAIN)
-    folder = config.get_base_dir()
-    if notes and folder.is_dir():
-        (folder / NOTES).write_text("\n".join([count, *notes]) + "\n", encoding="utf-8")

@@ -8,6 +8,7 @@ from torch.testing import assert_close
 
 from nrfgs_ns.densification import statistics
 from nrfgs_ns.densification.relocation import add_noise, split_evenly
+from nrfgs_ns.densification.statistics import Maxima, Step
 
 pytestmark = pytest.mark.gpu
 
@@ -68,7 +69,7 @@ def test_one_camera_is_the_kernels(monkeypatch):
     state = {name: torch.zeros(5000, device="cuda") for name in ("grad2d", "count", "radii")}
     gradients = torch.randn(3000, 2, device="cuda")
     twin = {name: value.clone() for name, value in state.items()}
-    statistics.add_in_torch(twin, info["gaussian_ids"], gradients, info["radii"], (320.0, 240.0), 640.0)
+    statistics.add_in_torch(twin, Step(info["gaussian_ids"], info["radii"], 640.0, (320.0, 240.0)), gradients)
     monkeypatch.setattr(statistics, "add_in_torch", None)
     statistics.take_statistics(state, info, gradients)
     for name in state:
@@ -77,11 +78,11 @@ def test_one_camera_is_the_kernels(monkeypatch):
 
 def test_one_cameras_maxima_are_the_kernels(monkeypatch):
     info = one_view()
-    maxima = [torch.full((5000,), start, device="cuda") for start in (0.0, 0.0, -2.0)]
-    step = torch.randn(3000, 2, device="cuda"), torch.rand(3000, device="cuda") - 0.5
-    twin = [value.clone() for value in maxima]
-    statistics.raise_in_torch(*twin, info["gaussian_ids"], info["radii"], *step, 640.0, (640.0, 480.0))
+    maxima = Maxima(*(torch.full((5000,), start, device="cuda") for start in (0.0, 0.0, -2.0)))
+    shown = torch.randn(3000, 2, device="cuda"), torch.rand(3000, device="cuda") - 0.5
+    twin = Maxima(*(value.clone() for value in maxima))
+    statistics.raise_in_torch(twin, Step(info["gaussian_ids"], info["radii"], 640.0, (640.0, 480.0)), *shown)
     monkeypatch.setattr(statistics, "raise_in_torch", None)
-    statistics.take_maxima(*maxima, info, *step)
+    statistics.take_maxima(maxima, info, *shown)
     for value, other in zip(maxima, twin, strict=True):
         torch.testing.assert_close(value, other, rtol=1e-6, atol=0.0)

@@ -114,10 +114,7 @@ def test_original_keeps_its_calendar():
     ("splatfacto", Splatfacto()),
     ("original", Original()),
     ("mcmc,budget=77,opacity-seen=base", Mcmc(budget=77, opacity_seen="base")),
-    (
-        "splatfacto,use_absgrad=False,densify_grad_thresh=4e-4",
-        Splatfacto(use_absgrad=False, densify_grad_thresh=4e-4),
-    ),
+    ("splatfacto,refine_every=50,densify_grad_thresh=4e-4", Splatfacto(refine_every=50, densify_grad_thresh=4e-4)),
 ])  # fmt: skip
 def test_a_word_is_a_strategy_with_its_options(text, config, tmp_path):
     assert strategy_from(text) == config == strategy_from(str(config))
@@ -132,7 +129,6 @@ def test_a_word_is_a_strategy_with_its_options(text, config, tmp_path):
     ("mcmc,budget=0", "budget is 0; it must be from 1 to"),
     ("mcmc,budget=many", "budget is 'many'; it must be a whole number"),
     ("original,opacity_seen=sparkle", "'sparkle'; use one of base, peak"),
-    ("splatfacto,use_absgrad=2", "use_absgrad is '2'; use one of true, false"),
     ("splatfacto,densify_grad_thresh=nan", "densify_grad_thresh is nan; it must be zero or positive"),
     ("splatfacto,cull_alpha_thresh=0.5", "cull_alpha_thresh is 0.5; it must be below 0.5"),
     ("splatfacto,refine_every=0", "refine_every is 0; it must be at least 1"),

@@ -19,6 +19,7 @@ COMMON = {
     "--pipeline.model.background-color": "black",
     "--pipeline.model.few-views": "off",
     "--pipeline.model.shrinkage": 0,
+    "--pipeline.model.warmup-steps": 0,  # is for one device
     "--pipeline.model.view-noise": 0,  # one device draws other numbers than two
 }
 PEAK = "splatfacto,opacity_seen=peak,warmup_length=2,refine_every=4,reset_alpha_every=6,densify_grad_thresh=1e-6"
@@ -81,7 +82,7 @@ def step_together(trainer) -> dict:
     from nrfgs_ns.distributed import comm
 
     pipeline, model = trainer.pipeline, trainer.pipeline.model
-    neutral = far_from_neutral(trainer)
+    model.step_cb(trainer.optimizers, 0)
     outputs, losses, _ = pipeline.get_train_loss_dict(0)
     sum(losses.values()).backward()
     shared = [value.grad for name, value in pipeline.named_parameters() if "gauss_params" not in name]
@@ -90,7 +91,6 @@ def step_together(trainer) -> dict:
         "rgb": outputs["rgb"].detach(),
         "losses": {key: value.detach() for key, value in losses.items()},
         "statistics": statistics(model, model._screen_info()),
-        "neutral": neutral,
         **values_and_gradients(pipeline),
     }
 
@@ -98,7 +98,7 @@ def step_together(trainer) -> dict:
 def step_alone(trainer, cameras) -> dict:
     """The same cameras one after the other; gradients of the mean of their losses, statistics of each by itself."""
     pipeline, model = trainer.pipeline, trainer.pipeline.model
-    neutral = far_from_neutral(trainer)
+    model.step_cb(trainer.optimizers, 0)
     images, all_losses, stats = [], [], {}
     for camera in cameras:
         outputs = model(camera)
@@ -114,19 +114,8 @@ def step_alone(trainer, cameras) -> dict:
                 value.grad = before[name]
         images.append(outputs["rgb"].detach())
         all_losses.append({key: value.detach() for key, value in losses.items()})
-    result = {"rgb": images, "losses": all_losses, "statistics": stats, "neutral": neutral}
+    result = {"rgb": images, "losses": all_losses, "statistics": stats}
     return result | values_and_gradients(pipeline)
-
-
-def far_from_neutral(trainer) -> list:
-    """How far the head is from neutral in the first view; the trainer's first step begins."""
-    model, cameras = trainer.pipeline.model, trainer.pipeline.datamanager.train_cameras
-    neutral = model.far_from_neutral(cameras[0:1], list(model.head.parameters()))
-    model.step_cb(trainer.optimizers, 0)
-    if neutral is None:
-        return []
-    visible, loss, slopes = neutral
-    return [visible, loss, *slopes]
 
 
 def values_and_gradients(pipeline) -> dict:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 import torch.distributed as dist
-from device import BY_ERROR, PEAK, PIXELS, PLAIN, RICH, one_step, told, train, trainer_of
+from device import BY_ERROR, PEAK, PIXELS, PLAIN, RICH, one_step, told, train
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
 
@@ -15,7 +15,6 @@ AVERAGED = {
     "--average-steps": 10,
     "--steps-per-save": 7,
     "--save-only-latest-checkpoint": False,
-    "--pipeline.model.warmup-steps": 0,
     "--pipeline.model.densification": f"{PEAK},stop_split_at=8",
     "--pipeline.sharding.rebalance-at": 100.0,
 }
@@ -144,8 +143,7 @@ def held_together(scene: Path, folder: Path) -> None:
 
 
 def averaged(scene: Path, folder: Path) -> None:
-    """12 steps with a mean over the last 10, and the last 4 of them again, from the checkpoint in between. That is
-    also looked at by one process."""
+    """12 steps with a mean over the last 10, and the last 4 of them again, from the checkpoint in between."""
     from nrfgs_ns.training import averaging
 
     averaging.LARGEST_SHARE = 1.0
@@ -172,15 +170,11 @@ def averaged(scene: Path, folder: Path) -> None:
     with CONSOLE.capture() as log:
         trainer = train(scene, folder / "averaged", world, 12, watch=watch, **options)
     whole, ended = told(trainer), parameters(trainer)
-    from_between = {**options, "--load-step": 7}
-    rest = told(train(scene, folder / "averaged-rest", world, 12, load=whole, watch=lopsided, **from_between))
-    result = {"after": after, "counts": counts, "ended": ended, "said": log.get()}
+    result = {"after": after[:], "counts": counts[:], "ended": ended, "said": log.get(), "saved": [str(whole)]}
     result["exposures"] = trainer.pipeline.model.photograph.shots.detach().clone()
-    if main:
-        alone = trainer_of(scene, folder / "averaged-alone", 1, **from_between, **{"--load-dir": whole})
-        mean = alone.mean
-        result |= {"saved": [str(whole), str(rest)], "alone": mean and mean.state()}
-    torch.save(result, folder / f"averaged-{dist.get_rank()}.pt")
+    counts.clear()
+    train(scene, folder / "averaged-rest", world, 12, load=whole, watch=watch, **options, **{"--load-step": 7})
+    torch.save(result | {"resumed": counts}, folder / f"averaged-{dist.get_rank()}.pt")
     dist.barrier()
 
 

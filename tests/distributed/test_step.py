@@ -32,13 +32,8 @@ def results(request, two_devices):
     return tuple(torch.load(two_devices / f"{request.param}-{who}.pt") for who in (0, 1, "alone"))
 
 
-def test_every_device_renders_its_own_camera_and_the_warm_up_sees_all_splats(results):
+def test_every_device_renders_its_own_camera(results):
     first, second, alone = results
-    assert [len(ours["neutral"]) for ours in results] == [len(alone["neutral"])] * 3  # one head has no warm-up
-    for ours in (first, second):
-        assert not alone["neutral"] or ours["neutral"][0] == alone["neutral"][0] > 0
-        for mine, theirs in zip(ours["neutral"][1:], alone["neutral"][1:], strict=True):
-            agree("neutral", mine, theirs)
     assert first["rgb"].shape != second["rgb"].shape
     for ours, theirs in zip((first, second), alone["rgb"], strict=True):
         agree("rgb", ours["rgb"], theirs)
@@ -94,13 +89,6 @@ def test_every_row_has_one_device(total, devices):
     parts = [list(range(total))[rows_of(rank, total, devices)] for rank in range(devices)]
     assert sorted(row for part in parts for row in part) == list(range(total))
     assert [len(part) for part in parts] == shard_counts(total, devices)
-
-
-def test_a_checkpoint_is_cut_where_as_many_devices_put_it_together():
-    parts = [rows_of(rank, 10, 3, written=[5, 1, 4]) for rank in range(3)]
-    assert [list(range(10))[part] for part in parts] == [[0, 1, 2, 3, 4], [5], [6, 7, 8, 9]]
-    assert rows_of(1, 10, 2, written=[5, 1, 4]) == slice(1, 10, 2)
-    assert rows_of(1, 10, 3, written=[5, 1, 3]) == slice(1, 10, 3), "counts of another table"
 
 
 @given(st.lists(st.integers(0, 1000), min_size=1, max_size=8))

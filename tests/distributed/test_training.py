@@ -2,7 +2,6 @@
 """Trainings on two devices: shards stay equal, checkpoints are whole, all stop together."""
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,8 +10,6 @@ from torch.testing import assert_close
 from nrfgs_ns.densification import CHANGE
 from nrfgs_ns.densification.error_guided import ERROR, WIDTH
 from nrfgs_ns.densification.strategy import CHANGE_BEFORE
-from nrfgs_ns.distributed.trainer import ShardedMean
-from nrfgs_ns.training.averaging import ParameterMean
 from nrfgs_ns.training.checkpoint_files import read, read_latest
 
 
@@ -151,42 +148,6 @@ def test_the_trained_model_is_the_mean_of_the_whole(devices):
     assert "parameter_mean" not in saved(devices[0]["saved"][0], 11, "training")
 
 
-def test_a_checkpoint_in_between_has_the_mean_of_the_whole(devices):
-    """As one device would have written it, and as one reads it. Four roundings of numbers up to 10."""
-    state = saved(devices[0]["saved"][0], 7, "training")["parameter_mean"]
-    assert state["count"] == 4
-    means = [whole_after(devices, step) for step in range(4, 8)]
-    for name in ("means", "latents"):
-        expected = torch.stack([one[SPLATS + name] for one in means]).mean(dim=0)
-        assert_close(state["means"][f"{name}.0"].double(), expected, rtol=0, atol=2.4e-6)
-    alone = devices[0]["alone"]
-    assert alone["count"] == 4 and alone["means"].keys() == state["means"].keys()
-    assert all(torch.equal(alone["means"][name], mean) for name, mean in state["means"].items())
-
-
-def test_a_mean_continues_to_the_bit(devices):
-    one, other = (saved(path, 11) for path in devices[0]["saved"])
-    for name, value in one.items():
-        if isinstance(value, torch.Tensor):
-            assert_close(other[name], value, rtol=0, atol=0, msg=lambda text, name=name: name + text)
-
-
-@pytest.mark.parametrize("written, count", [(5, 3), (6, 0)])
-def test_each_device_takes_its_rows_of_a_mean_or_none_does(written, count):
-    """Of 5 splats dealt out to two devices the second has 2, as it would have of 6 were they 4; a mean over 6 is of
-    splats that are gone."""
-    for rows in (slice(0, 5, 2), slice(1, 5, 2)):
-        splats, weight = torch.nn.Parameter(torch.arange(5.0)[rows]), torch.nn.Parameter(torch.zeros(2))
-        optimizers = {"means": torch.optim.Adam([splats]), "field": torch.optim.Adam([weight])}
-        model = SimpleNamespace(
-            gauss_params={"means": splats}, counts=[3, 2], loaded=rows, densification=SimpleNamespace(state={})
-        )
-        means = {"means.0": 10.0 + torch.arange(float(written)), "field.0": torch.ones(2)}
-        mean = ShardedMean()
-        mean.load_state({"count": 3, "means": means}, model, optimizers)
-        assert mean.count == count
-        ParameterMean.install(mean)
-        assert_close(splats.detach(), torch.arange(5.0)[rows] + (10.0 if count else 0.0), rtol=0, atol=0)
-        assert weight.tolist() == ([1.0, 1.0] if count else [0.0, 0.0])
-        mean.is_current = lambda optimizers: False  # the guard has taken a splat out, here or elsewhere
-        assert mean.whole_state(model, optimizers) == {}
+def test_no_checkpoint_has_a_mean_and_what_goes_on_averages_its_own_steps(devices):
+    assert "parameter_mean" not in saved(devices[0]["saved"][0], 7, "training")
+    assert [device["resumed"] for device in devices] == [[1, 2, 3, 4]] * 2

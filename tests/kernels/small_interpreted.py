@@ -14,7 +14,7 @@ from test_against_twin import scenes
 from tile_list_cases import Splats, assert_lists, splats
 from torch.testing import assert_close
 
-from nrfgs_ns.densification.statistics import add_in_torch, raise_in_torch
+from nrfgs_ns.densification.statistics import Maxima, Step, add_in_torch, raise_in_torch
 from nrfgs_ns.densification.statistics_triton import add, raise_maxima
 from nrfgs_ns.image import ssim_triton
 from nrfgs_ns.image.ssim import photometric_loss
@@ -54,8 +54,9 @@ def test_the_kernel_adds_what_its_twin_adds(names, visible):
     gradients, radii = torch.randn(visible, 2), torch.randint(0, 5, (visible,), dtype=torch.int32)
     mine = {name: torch.rand(400) for name in names}
     theirs = {name: value.clone() for name, value in mine.items()}
-    add(mine["grad2d"], mine["count"], mine.get("radii"), rows, gradients, radii, (400.0, 300.0), 1 / 800.0)
-    add_in_torch(theirs, rows, gradients, radii, (400.0, 300.0), 800.0)
+    step = Step(rows, radii, 800.0, (400.0, 300.0))
+    add(mine, step, gradients)
+    add_in_torch(theirs, step, gradients)
     for name in names:
         assert_close(mine[name], theirs[name], rtol=1e-6, atol=0.0)
 
@@ -67,10 +68,12 @@ def test_the_kernel_raises_what_its_twin_raises(grows, peak, visible):
     torch.manual_seed(0)
     rows, radii = torch.randperm(400)[:visible], torch.randint(0, 5, (visible,), dtype=torch.int32)
     gradients, change = torch.randn(visible, 2) if grows else None, torch.rand(visible) - 0.5 if peak else None
-    mine = [torch.rand(400) / 50, torch.rand(400) * 300 if grows else None, torch.rand(400) - 1.0 if peak else None]
-    theirs = [None if value is None else value.clone() for value in mine]
-    raise_maxima(*mine, rows, radii, gradients, change, 1 / 400.0, (400.0, 300.0))
-    raise_in_torch(*theirs, rows, radii, gradients, change, 400.0, (400.0, 300.0))
+    errors, changes = torch.rand(400) * 300 if grows else None, torch.rand(400) - 1.0 if peak else None
+    mine = Maxima(torch.rand(400) / 50, errors, changes)
+    theirs = Maxima(*(None if value is None else value.clone() for value in mine))
+    step = Step(rows, radii, 400.0, (400.0, 300.0))
+    raise_maxima(mine, step, gradients, change)
+    raise_in_torch(theirs, step, gradients, change)
     for value, twin in zip(mine, theirs, strict=True):
         if twin is not None:
             assert_close(value, twin, rtol=1e-6, atol=0.0)

@@ -13,6 +13,7 @@ from torch.testing import assert_close
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.densification import ErrorGuided, Mcmc, Splatfacto
 from nrfgs_ns.model.loss import shrinkage
+from nrfgs_ns.model.view_noise import camera_spacing
 
 
 def ready(scene, out, steps, *options):
@@ -48,13 +49,17 @@ def test_copies_of_photographs_raise_no_trust(twice, tiny_scene, tmp_path, no_cu
 
 def test_a_training_goes_on_with_the_views_that_it_counted(twice, tmp_path, no_cuda):
     config = trained(command_line("nrfgs", twice, tmp_path / "new", 2, REFINING))
-    again = ready(twice, tmp_path / "again", 4, {"--load-dir": models_of(config)}).pipeline.model
+    pipeline = ready(twice, tmp_path / "again", 4, {"--load-dir": models_of(config)}).pipeline
+    again, spacing = (
+        pipeline.model,
+        camera_spacing(pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]),
+    )
     trust = 8 / 28
     assert again.num_views == 8 and again.trust == trust
     by_error = ready(twice, tmp_path / "by error", 1, {"--pipeline.model.densification": "error-guided"}).pipeline.model
     assert by_error.densification.config == ErrorGuided().build(16, 8, 1.0).config
     assert again.head.config == NrfConfig(opacity_scale=trust * 0.2) and again.noise_factor == 0.5 / trust
-    assert again.view_noise.sigma == again.noise_factor * again.camera_spacing / 3**0.5
+    assert again.view_noise.sigma == again.noise_factor * spacing / 3**0.5
 
 
 def test_nothing_is_drawn_before_half_the_nearest_depth(tiny_scene, tmp_path, no_cuda):

@@ -18,6 +18,7 @@ from torch.testing import assert_close
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.appearance.sh import ShConfig
+from nrfgs_ns.errors import InputError
 from nrfgs_ns.model.model import NrfgsModel
 from nrfgs_ns.model.renderer import Pinhole, Pinholes, composite_view, pinhole, project_view, world_to_camera
 from nrfgs_ns.model.warmup import warm_up
@@ -181,6 +182,9 @@ def test_warm_up_quiets_a_loud_field_and_moves_nothing_else(build):
     for name, value in model.gauss_params.items():
         assert torch.equal(value, splats[name]) and value.grad is None
     assert all(weight.grad is None for weight in model.head.parameters())
+    model.warms_up = False
+    with pytest.raises(InputError, match="on one device only"):
+        warm_up(model, cameras, steps=1)
 
 
 @pytest.mark.parametrize("method", ["nrfgs", "nrfgs-sh"])

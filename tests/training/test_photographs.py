@@ -31,21 +31,21 @@ SAME, DIFFERENT = pairs_with([0.01] * 10), pairs_with([0.5, -0.8, 0.2, 0.5, -0.4
 CENTERS = torch.arange(11.0)[:, None] * torch.tensor([1.0, 0.0, 0.0])
 
 
-@pytest.mark.parametrize(("pairs", "known", "wanted", "words"), [
-    (SAME, [NAN] * 11, False, "varies by 0.01 stops, colour by 0.01"),
-    (DIFFERENT, [NAN] * 11, True, "exposure varies by 0.38 stops"),
-    (pairs_with([0.5, -0.5, 0.5]), [NAN] * 11, False, "in common to compare them"),
-    (pairs_with([]), [0.0, 1.5] + [NAN] * 9, True, "exposure varies by 0.75 stops"),
-    (SAME, [0.3] + [NAN] * 10, False, "EXIF: exposure varies by 0.00 stops"),
-    (SAME, [0.3, 0.5] * 5 + [0.3], False, "EXIF: exposure varies by 0.10 stops"),
+@pytest.mark.parametrize(("pairs", "known", "wanted"), [
+    (SAME, [NAN] * 11, False),
+    (DIFFERENT, [NAN] * 11, True),
+    (pairs_with([0.5, -0.5, 0.5]), [NAN] * 11, False),
+    (pairs_with([]), [0.0, 1.5] + [NAN] * 9, True),
+    (SAME, [0.3] + [NAN] * 10, False),
+    (SAME, [0.3, 0.5] * 5 + [0.3], False),
     # The light changed, and the camera followed it.
-    (SAME, [0.0, 0.9] * 5 + [0.0], False, "varies by 0.45 stops, which explains 0% of the difference"),
-    (DIFFERENT, [0.0, 0.7] * 5 + [0.0], True, "exposure varies by 0.35 stops, which explains"),
+    (SAME, [0.0, 0.9] * 5 + [0.0], False),
+    (DIFFERENT, [0.0, 0.7] * 5 + [0.0], True),
 ])  # fmt: skip
-def test_the_evidence_decides(pairs, known, wanted, words):
+def test_the_evidence_decides(pairs, known, wanted):
     seen = estimate(pairs, torch.full((11,), NAN), CENTERS)
     evidence = Evidence(pairs, CENTERS, torch.tensor(known), seen)
-    assert evidence.calls_for_learning == wanted and words in evidence.numbers
+    assert evidence.calls_for_learning == wanted
 
 
 def test_exposure_in_stops_of_exif_from_the_data_set_or_else_from_the_file(tmp_path):
