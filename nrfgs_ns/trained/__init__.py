@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trained models: found, loaded and shown (`nrfgs view`)."""
+"""Trained models: found, loaded, evaluated (`nrfgs eval`) and shown (`nrfgs view`)."""
