@@ -87,9 +87,9 @@ def kernels(device) -> list[Finding]:
     reasons: list[str] = []
     trial.logger.addHandler(handler := logging.Handler())
     handler.emit = lambda record: reasons.append(record.getMessage())
-    gsplat = Finding("gsplat's kernels", "load")
     try:
         load_gsplat(device)
+        gsplat = Finding("gsplat's kernels", "load")
     except Exception as error:
         fix = "They are compiled at first use: install a C++ compiler and the CUDA toolkit (nvcc) of PyTorch's version."
         gsplat = Finding("gsplat's kernels", f"do not load ({type(error).__name__}: {error})", fix, True)

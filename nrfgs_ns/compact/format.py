@@ -170,16 +170,12 @@ def _unpack(entry: Mapping[str, Any], body: bytes) -> np.ndarray:
     complete = not body or unpacker.eof and not unpacker.unused_data and unpacker.check == lzma.CHECK_NONE
     if len(raw) != count * size or not complete:
         raise ValueError(f"it does not hold {count} numbers of {size} bytes")
-    blocks = _blocks(body)
+    # Its index, whose length is at the end, begins with 0 and the number of blocks, up to 127.
+    blocks = body[-12 - 4 * (int.from_bytes(body[-8:-4], "little") + 1) + 1] if body else 0
     if blocks > 1 or blocks == 1 and not body.startswith(ONE_BLOCK, 12):
         raise ValueError(f"it is packed in {blocks} blocks or with other filters")
     planes = np.frombuffer(raw, dtype=np.uint8).reshape(size, count)
     return np.ascontiguousarray(planes.T).view(np.dtype(entry["dtype"]).newbyteorder("<")).reshape(entry["shape"])
-
-
-def _blocks(body: bytes) -> int:
-    """Blocks of a valid xz stream, up to 127: its index, whose length is at the end, begins with 0 and their number."""
-    return body[-12 - 4 * (int.from_bytes(body[-8:-4], "little") + 1) + 1] if body else 0
 
 
 def _coded(table: Table) -> tuple[np.ndarray, bytes]:

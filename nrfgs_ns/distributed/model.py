@@ -90,7 +90,7 @@ class ShardedModel(NrfgsModel):
         projection = self._project_everywhere(field.splats, pinholes)
         centers = torch.stack([one.center for one in pinholes]).index_select(0, projection.camera_ids)
         appearance = self.noisy(field).seen_from(View(projection, centers))
-        drawn, arrived = send_to_cameras(projection, appearance, *self.sizes[own], self.compositing["absgrad"])
+        drawn, arrived = send_to_cameras(projection, appearance, *self.sizes[own], self.needs_absgrad)
         look = self.look_of(self._photograph_of(cameras[own]))
         outputs, _ = self.composite(View(drawn, mine.center, pinhole=mine), arrived, look=look)
         self.info = {name: getattr(projection, name) for name in ROWS}  # the image's rows are other devices' splats

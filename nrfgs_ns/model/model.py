@@ -98,11 +98,6 @@ class NrfgsModel(ExportedModel):
         """Length of the noise on the head's camera centre, in spacings of the training cameras."""
         return self.config.view_noise / self.trust
 
-    @property
-    def suited_head(self) -> dict[str, Any]:
-        """Options of the head that a checkpoint, the number of views or the densification has set."""
-        return differences(self.config.appearance, self.head.config)
-
     def _initial_splats(self) -> dict[str, Tensor]:
         return initial_splats(self.config, self.head, self.seed_points, self.scene_unit)
 
@@ -252,17 +247,14 @@ class NrfgsModel(ExportedModel):
         """Composite any appearance of a view as this model is configured (`composite_view`), over a colour [3] instead
         of the configuration's background if one is given, with a look (`look_of`)."""
         background = self._get_background_color() if background is None else background
-        return composite_view(view, appearance, background, look=look, **self.compositing)
+        image_of = self.head.image_of if self.head.at_pixel else None
+        how = {"with_depth": not self.training, "absgrad": self.needs_absgrad, "assume_finite": self.training}
+        return composite_view(view, appearance, background, image_of=image_of, look=look, **how)
 
     @property
-    def compositing(self) -> dict[str, Any]:
-        """Options of `composite_view`."""
-        return {
-            "image_of": self.head.image_of if self.head.at_pixel else None,
-            "with_depth": not self.training,
-            "absgrad": self.training and self.densification.needs_absgrad(self.step),
-            "assume_finite": self.training,
-        }
+    def needs_absgrad(self) -> bool:
+        """Whether densification needs absolute gradients of this step (`Strategy.needs_absgrad`)."""
+        return self.training and self.densification.needs_absgrad(self.step)
 
     def render(self, field: Field, camera: Cameras, noisy: Field) -> dict[str, Tensor]:
         """Render any field as `get_outputs` renders the model's own; `noisy`: as its head sees it, with or without
@@ -380,7 +372,7 @@ class NrfgsModel(ExportedModel):
             "views": self.num_views,
             "near": self.near,
         }
-        if suited := self.suited_head:
+        if suited := differences(self.config.appearance, self.head.config):
             state["capacity"] = {"head": suited}
         return state if self._scheduled is None else {**state, "schedule_step": self._scheduled}
 

@@ -17,8 +17,8 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Compact
 from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, Similarity
 from nrfgs_ns.export.ply import on_screen, render_splats
+from nrfgs_ns.trained.command import View
 from nrfgs_ns.trained.loading import load_training, measure_loss
-from nrfgs_ns.trained.view import View
 from nrfgs_ns.training.checkpoint_files import find
 from nrfgs_ns.training.trainer import end_earlier_logs
 

@@ -18,8 +18,8 @@ from websockets.asyncio.client import connect
 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Compact
+from nrfgs_ns.trained.command import view_file
 from nrfgs_ns.trained.loading import load_model
-from nrfgs_ns.trained.view import view_file
 from nrfgs_ns.viewer.server import LocalViewerConfig
 
 pytestmark = pytest.mark.usefixtures("no_cuda")

@@ -1,13 +1,43 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`nrfgs view`: nerfstudio's viewer, as `ns-viewer` opens it, also for a training or file from somebody else."""
+"""`nrfgs eval` and `nrfgs view`: what `ns-eval` reports, and nerfstudio's viewer, as `ns-viewer` opens it, also for a
+training or file from somebody else."""
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from time import sleep
 from types import SimpleNamespace
 
 from nrfgs_ns.compact.format import MAGIC
+from nrfgs_ns.files import check_writable, write_whole
 from nrfgs_ns.trained.find import NamesTraining
+
+
+@dataclass
+class Eval(NamesTraining):
+    """Evaluate a trained model on its test views. Its config.yml is read as options only and runs no code."""
+
+    output_path: Path = Path("output.json")
+    """the file for the numbers, as ns-eval writes it"""
+    render_output_path: Path | None = None
+    """folder for the pictures, truth and rendering side by side"""
+
+    def main(self) -> None:
+        path, pictures = self.config(), self.render_output_path
+        check_writable(self.output_path, "--output-path")
+        if pictures is not None:
+            check_writable(pictures / "eval.png", "--render-output-path")
+        from nrfgs_ns.threads import few_threads
+        from nrfgs_ns.trained.loading import load_training
+
+        with few_threads() as threads:
+            trained = load_training(path, "test")
+            threads.suit_to(trained.pipeline)
+            results = trained.pipeline.get_average_eval_image_metrics(output_path=pictures, get_std=True)
+        numbers = {name: getattr(trained.config, name) for name in ("experiment_name", "method_name")}
+        numbers |= {"checkpoint": str(trained.checkpoint), "results": results}
+        write_whole(self.output_path, json.dumps(numbers, indent=2) + "\n")
+        print(f"Saved results to: {self.output_path}")
 
 
 @dataclass
