@@ -32,6 +32,13 @@ def scene(head: AppearanceHead, count: int = 11, dtype: torch.dtype = torch.floa
     return splats, visible, 6 * rand(len(visible), 3) - 3
 
 
+def random_field(config: AppearanceHeadConfig) -> tuple[Field, torch.Tensor, torch.Tensor]:
+    """A field of 40 splats in float32, the visible ones, and a camera centre for each."""
+    head = awake(config, torch.float32).requires_grad_(False)
+    splats, visible, centers = scene(head, count=40, dtype=torch.float32)
+    return Field(head, splats), visible, centers
+
+
 def assert_same(field: Field, other: Field, visible: torch.Tensor, centers: torch.Tensor, atol: float = 2e-5) -> None:
     """Two fields look the same. By default up to float32's rounding: sums of up to 60 products of numbers of order 1 to
     10, rounded at 2^-24 each, behind slopes of at most 0.2."""

@@ -3,7 +3,7 @@
 
 import pytest
 import torch
-from head_cases import assert_same, awake, scene
+from head_cases import assert_same, random_field
 
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.nrf import NrfConfig
@@ -18,9 +18,7 @@ CONFIGS = {
 
 @pytest.fixture(params=CONFIGS)
 def case(request):
-    head = awake(CONFIGS[request.param], torch.float32).requires_grad_(False)
-    splats, visible, centers = scene(head, count=40, dtype=torch.float32)
-    return Field(head, splats), visible, centers
+    return random_field(CONFIGS[request.param])
 
 
 def test_full_rank_is_the_head(case):

@@ -6,7 +6,7 @@ import json
 import pytest
 import torch
 import tyro
-from head_cases import assert_same, awake, scene
+from head_cases import assert_same, awake, random_field
 from short_trainings import LOUD, command_line, trained
 from torch.testing import assert_close
 
@@ -35,15 +35,8 @@ def test_the_command(tiny_scene, tmp_path, capsys):
         tyro.cli(ablation.Inspect, args=["--load-config", str(config), "--views", "0"]).main()
 
 
-def random_field(config: NrfConfig = SPLIT):
-    """A field of 40 splats, the visible ones, and a camera centre for each."""
-    head = awake(config, torch.float32).requires_grad_(False)
-    splats, visible, centers = scene(head, count=40, dtype=torch.float32)
-    return Field(head, splats), visible, centers
-
-
 def test_parts_left_out_are_what_their_definition_says():
-    whole, visible, centers = random_field()
+    whole, visible, centers = random_field(SPLIT)
     small, shut = ablation.without_high_branch(whole), awake(SPLIT, torch.float32).requires_grad_(False)
     shut.load_state_dict(whole.head.state_dict())
     shut.high[2].weight[3], shut.high[2].bias[3] = 0.0, -1e4

@@ -8,6 +8,7 @@ import pytest
 import torch
 from make_gsplat_fixtures import Case
 from torch import Tensor
+from torch.testing import assert_close
 
 from nrfgs_ns.rasterizer import Projection, ProjectionOptions, composite, project, torch_cpu
 
@@ -52,6 +53,18 @@ def rasterization(
 
             dense_means2d.register_hook(densify)
     return render, alphas, info
+
+
+def assert_background_shines(case: Case) -> dict[str, Any]:
+    """Where light is left, the background is seen, and has a gradient; returns `info`."""
+    background = torch.tensor([[0.3, 0.6, 0.9]], requires_grad=True)
+    black, alphas, _ = rasterization(*case.arguments())
+    render, _, info = rasterization(*case.arguments(), backgrounds=background)
+    assert_close(render, black + (1 - alphas) * background[:, None, None])
+    weight = torch.rand(render.shape)
+    (render * weight).sum().backward()
+    assert_close(background.grad, (weight * (1 - alphas)).sum((1, 2)))
+    return info
 
 
 class Theirs(Exception):

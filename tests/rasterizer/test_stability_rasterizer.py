@@ -13,7 +13,7 @@ from gsplat_call import rasterization
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nrfgs_ns.rasterizer import ProjectionOptions, project
+from nrfgs_ns.rasterizer import Projection, ProjectionOptions, gsplat_cuda, project
 from nrfgs_ns.rasterizer.torch_cpu import compositing, tiles
 from nrfgs_ns.rasterizer.torch_cpu.projection import MIN_QUATERNION
 
@@ -195,58 +195,53 @@ def test_a_splat_that_is_not_finite_is_not_there(device, mode, value, name):
         assert 0 not in info["gaussian_ids"]
 
 
-def test_rows_that_gsplat_lets_through_as_nan_are_projected_away(monkeypatch):
-    """gsplat's comparisons let NaN pass. A stand-in for its kernel does the same; the back end takes those rows out."""
-    from nrfgs_ns.rasterizer import gsplat_cuda
+@pytest.fixture
+def calls(monkeypatch) -> list[int]:
+    """How many splats each call of gsplat's projection has. Its stand-in lets NaN pass, as gsplat's comparisons do, and
+    takes no empty table: 1.5.3 divides by the number of splats, and the process would end without a word."""
+    counts = []
 
-    calls = []
-
-    def kernel(means, covars, quats, scales, viewmats, Ks, width, height, **settings):
-        calls.append(len(means))
+    def kernel(means, covars, quats, scales, viewmats, Ks, width, height, *, calc_compensations, **settings):
+        assert len(means) > 0
+        counts.append(len(means))
         harmless = [torch.nan_to_num(table, 0.5, 0.5, 0.5) for table in (means, quats, scales)]
-        p = project(*harmless, viewmats, Ks, width, height)
+        options = ProjectionOptions("antialiased" if calc_compensations else "classic")
+        p = project(*harmless, viewmats, Ks, width, height, options)
         spoilt = ~torch.isfinite(means[p.gaussian_ids]).all(1)
         conics = p.conics.masked_fill(spoilt[:, None], math.nan)
-        if gsplat_cuda.HAS_BATCHES:
-            sides = p.radii[:, None].expand(-1, 2)
-            return p.camera_ids, p.camera_ids, p.gaussian_ids, sides, p.means2d, p.depths, conics, None
-        return p.camera_ids, p.gaussian_ids, p.radii, p.means2d, p.depths, conics, None
+        sides = p.radii[:, None].expand(-1, 2) if gsplat_cuda.HAS_BATCHES else p.radii
+        rows = p.camera_ids, p.gaussian_ids, sides, p.means2d, p.depths, conics, p.compensations
+        return rows[:1] * gsplat_cuda.HAS_BATCHES + rows
 
     monkeypatch.setattr(gsplat_cuda, "fully_fused_projection", kernel)
-    splats = cloud(means=math.nan)
-    p = gsplat_cuda.project([splats[name] for name in NAMES[:3]], camera(), ProjectionOptions())
+    return counts
+
+
+def by_gsplat(splats: dict[str, torch.Tensor], **options) -> Projection:
+    return gsplat_cuda.project([splats[name] for name in NAMES[:3]], camera(), ProjectionOptions(**options))
+
+
+def test_rows_that_gsplat_lets_through_as_nan_are_projected_away(calls):
+    p = by_gsplat(cloud(means=math.nan))
     assert p.gaussian_ids.tolist() == [1, 2, 3, 4, 5] and calls == [6, 5]
     assert torch.isfinite(p.conics).all()
-    sound = cloud()
-    gsplat_cuda.project([sound[name] for name in NAMES[:3]], camera(), ProjectionOptions())
+    by_gsplat(cloud())
     assert calls == [6, 5, 6]  # no second look where nothing is wrong
-    in_training = ProjectionOptions(assume_finite=True)  # a training's guard finds such splats
-    gsplat_cuda.project([splats[name] for name in NAMES[:3]], camera(), in_training)
+    by_gsplat(cloud(means=math.nan), assume_finite=True)  # a training's guard finds such splats
     assert calls == [6, 5, 6, 6]
 
 
 @modes
 @pytest.mark.parametrize("bad", [None, math.nan])
-def test_gsplats_projection_never_sees_an_empty_table(monkeypatch, mode, bad):
-    """1.5.3 divides by the number of splats: the process would end without a word."""
-    from nrfgs_ns.rasterizer import gsplat_cuda
-
-    def kernel(means, covars, quats, scales, viewmats, Ks, width, height, **settings):
-        assert len(means) > 0
-        ids = torch.arange(len(means))
-        sides = torch.ones(len(means), 2, dtype=torch.int32)
-        rows = (ids * 0, ids, sides if gsplat_cuda.HAS_BATCHES else sides[:, 0], means[:, :2], means[:, 2], scales)
-        return *(rows[:1] if gsplat_cuda.HAS_BATCHES else ()), *rows, means[:, 2]
-
-    monkeypatch.setattr(gsplat_cuda, "fully_fused_projection", kernel)
+def test_gsplats_projection_never_sees_an_empty_table(calls, mode, bad):
     count = 0 if bad is None else 2
     splats = {name: value.detach()[:count].requires_grad_() for name, value in cloud().items()}
     if bad is not None:
         splats["means"] = torch.full((2, 3), bad, requires_grad=True)
-    p = gsplat_cuda.project([splats[name] for name in NAMES[:3]], camera(), ProjectionOptions(mode))
+    p = by_gsplat(splats, rasterize_mode=mode)
     assert p.gaussian_ids.shape == (0,) and p.means2d.shape == (0, 2) and p.conics.shape == (0, 3)
     assert p.radii.shape == (0,) and p.radii.dtype == torch.int32
-    assert (p.compensations is None) == (mode == "classic")
+    assert (p.compensations is None) == (mode == "classic") and calls == [2] * (bad is not None)
     (p.means2d.sum() + p.depths.sum() + p.conics.sum()).backward()  # nothing to find, nothing in the way
 
 
