@@ -10,7 +10,7 @@ import torch
 
 from nrfgs_ns import doctor
 from nrfgs_ns.densification import statistics
-from nrfgs_ns.image import metrics, ssim
+from nrfgs_ns.image import ssim
 from nrfgs_ns.kernels.trial import Gate
 from nrfgs_ns.training import optimizers, pipeline
 
@@ -75,18 +75,6 @@ def test_what_cannot_be_imported_is_told(monkeypatch):
     monkeypatch.setattr(doctor.importlib, "import_module", Mock(side_effect=OSError("libGL.so.1: cannot open")))
     (finding,) = doctor.imports()
     assert finding.broken and finding.fix and "libGL.so.1" in finding.state
-
-
-@pytest.mark.parametrize(("cuda", "fix"), [("13.2", "driver"), (None, "PyTorch for CUDA")])
-@pytest.mark.parametrize("advice", [None, "put it there"])
-def test_without_a_gpu_it_says_what_that_means(monkeypatch, cuda, fix, advice):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(torch.version, "cuda", cuda)
-    monkeypatch.setattr(metrics, "lpips_advice", lambda: advice)
-    findings = {finding.name: finding for finding in doctor.machine()}
-    assert findings.keys() == {"LPIPS", "GPU"} and not any(finding.broken for finding in findings.values())
-    assert fix in findings["GPU"].fix and "CPU" in findings["GPU"].fix
-    assert findings["LPIPS"].fix == (advice or "")
 
 
 def test_kernels_that_fail_are_told_apart(monkeypatch):

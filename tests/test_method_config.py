@@ -91,14 +91,8 @@ def test_everything_else_is_splatfactos(name):
 
 @pytest.mark.parametrize("name, differs", [
     ("nrfgs-fast", {"max_num_iterations": 10_000, "schedule_steps": 30_000, "average_steps": 200}),
-    (
-        "nrfgs-best",
-        {
-            "max_num_iterations": 30_000,
-            "average_steps": 200,
-            "pipeline.model.densification": "error-guided,threshold=0.0016",
-        },
-    ),
+    ("nrfgs-best", {"max_num_iterations": 30_000, "average_steps": 200,
+                    "pipeline.model.densification": "error-guided,threshold=0.0016"}),
 ])  # fmt: skip
 def test_a_preset_differs_in_what_it_says_and_shares_nothing(name, differs):
     ours, base = dict(leaves(PRESETS[name].config)), dict(leaves(menu.nrfgs.config))

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The kernels of the loss, the growth's statistics, the tiles' lists and compositing in Triton's interpreter against
-their twins."""
+"""Kernels of the loss, growth, the tiles' lists and compositing in Triton's interpreter against their twins."""
 
 import pytest
 import quick_interpreter  # noqa: F401

@@ -17,6 +17,7 @@ PSNR = BY_NAME["PSNR"]
 
 
 def record(psnr, ssim=0.9, lpips=None, train=None, seconds=10.0, jobs=1, splats=1000, parts=1, device="a card"):
+    sizes = {"fps": 50.0, "splats": splats, "parameter_bytes": 2_000_000, "checkpoint_bytes": 6_000_000}
     return {
         "machine": {"device": device, "torch": "2.11"},
         "jobs": jobs,
@@ -24,10 +25,7 @@ def record(psnr, ssim=0.9, lpips=None, train=None, seconds=10.0, jobs=1, splats=
         "measured": {
             "test": {"psnr": psnr, "ssim": ssim, "ms_ssim": None, "l1": 0.01, "lpips": lpips},
             "train": None if train is None else {"psnr": train},
-            "fps": 50.0,
-            "splats": splats,
-            "parameter_bytes": 2_000_000,
-            "checkpoint_bytes": 6_000_000,
+            **sizes,
         },
     }
 
