@@ -73,8 +73,8 @@ def machine() -> list[Finding]:
         fix = f"Training runs on the CPU, slowly; to use an NVIDIA GPU install {need}."
         return [*findings, Finding("GPU", f"none; {build}", fix)]
     name, (free, total) = torch.cuda.get_device_name(), (size / 1e9 for size in torch.cuda.mem_get_info())
-    findings.append(Finding("GPU", f"{name}, {free:.1f} of {total:.1f} GB free; {build}"))
-    return findings + kernels(torch.device("cuda", torch.cuda.current_device()))
+    gpu = Finding("GPU", f"{name}, {free:.1f} of {total:.1f} GB free; {build}")
+    return [*findings, gpu, *kernels(torch.device("cuda", torch.cuda.current_device()))]
 
 
 def kernels(device) -> list[Finding]:

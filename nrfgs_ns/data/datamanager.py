@@ -228,11 +228,12 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         return {"num_images": len(self.train_dataset), "unseen_cameras": unseen, "generator": generator}
 
     def load_sampling_state(self, state: dict[str, Any]) -> None:
-        """Continue the order of cameras from `sampling_state()`; InputError if the number of images is another."""
-        if state["num_images"] != len(self.train_dataset):
+        """Continue the order of cameras from `sampling_state()`; InputError if the number of images is another, or the
+        order was not random, as it could be in older checkpoints."""
+        if (state["num_images"], state.get("strategy", "random")) != (len(self.train_dataset), "random"):
             raise InputError(
-                f"{self.get_datapath()}: the checkpoint was trained on {state['num_images']} images, but now these are "
-                f"{len(self.train_dataset)}. Continue with the same images and split, or train anew."
+                f"{self.get_datapath()}: the checkpoint was trained on {state['num_images']} images, or in another "
+                f"order; now these are {len(self.train_dataset)}, at random. Continue with the same, or train anew."
             )
         self.train_unseen_cameras = list(state["unseen_cameras"])
         version, words, gauss = state["generator"]

@@ -69,8 +69,9 @@ class Splatfacto(GradientConfig):
 
     def check(self) -> None:
         super().check()
-        opacity = self.cull_alpha_thresh
-        self.require(opacity < 0.5, "cull_alpha_thresh", "below 0.5, since a reset is to twice as much")
+        self.require(self.cull_alpha_thresh < 0.5, "cull_alpha_thresh", "below 0.5, since a reset is to twice as much")
+        for name, fixed in (("use_absgrad", True), ("stop_screen_size_at", 4000)):  # in an older config.yml
+            self.require(getattr(self, name, fixed) == fixed, name, f"{fixed}, its only value")
 
     def build(self, num_images: int, num_views: int, scene_unit: float) -> "GradientDensification":
         return self._build(

@@ -260,8 +260,7 @@ class CompositeSplats(torch.autograd.Function):
         _, _, *tables, _, alphas, _ = saved = ctx.saved_tensors
         gradients = [torch.zeros_like(table) for table in tables]
         absgrad = torch.zeros_like(tables[0]) if ctx.absgrad else alphas
-        upstream = d_render.contiguous(), d_alphas.contiguous()
-        arguments = *saved, *upstream, *gradients, absgrad, *ctx.numbers
+        arguments = *saved, d_render.contiguous(), d_alphas.contiguous(), *gradients, absgrad, *ctx.numbers
         launch_backward(ctx.grid, *arguments, ABSGRAD=ctx.absgrad, num_warps=1)
         if ctx.absgrad:
             tables[0].absgrad = absgrad

@@ -170,7 +170,7 @@ def _our_image(
     from .compositing_triton import CompositeSplats
 
     means2d, conics, colors, opacities = (table.contiguous() for table in tables)
-    background = colors.new_zeros(1, 3) if backgrounds is None else backgrounds.contiguous()
+    background = colors.new_zeros(1, 3) if backgrounds is None else backgrounds.to(colors.dtype).contiguous()
     return CompositeSplats.apply(means2d, conics, opacities, colors, background, *lists, shape, absgrad)
 
 

@@ -79,8 +79,9 @@ def test_image_of_another_size_is_named(capture):
 
 def test_the_state_of_another_run_is_refused(capture):
     state = manager(capture).sampling_state()
-    with pytest.raises(InputError, match=r"trained on 8 images.*now these are 5"):
-        manager(capture, {"eval_interval": 2}).load_sampling_state(state)
+    for other, options, now in ((state, {"eval_interval": 2}, 5), (state | {"strategy": "fps"}, {}, 8)):
+        with pytest.raises(InputError, match=f"trained on 8 images.*now these are {now}"):
+            manager(capture, options).load_sampling_state(other)
 
 
 @pytest.mark.parametrize("factor", [1, 2])

@@ -3,6 +3,7 @@
 
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -75,9 +76,6 @@ def draw_with_our_kernels(monkeypatch: pytest.MonkeyPatch, device: str, side: in
     """Composite what the CPU has projected by our kernels on a device, in tiles of a side, and never by gsplat's."""
     from nrfgs_ns.rasterizer import gsplat_cuda
 
-    def theirs(*_: Any) -> None:
-        raise Theirs
-
     usual = torch_cpu.composite
 
     def composite(projection: Projection, colors: Tensor, opacities: Tensor, backgrounds: Tensor | None, *how: bool):
@@ -97,7 +95,7 @@ def draw_with_our_kernels(monkeypatch: pytest.MonkeyPatch, device: str, side: in
         return render.cpu(), alphas.cpu(), lists
 
     monkeypatch.setattr(gsplat_cuda, "SMALL_TILE", side)
-    monkeypatch.setattr(gsplat_cuda, "_gsplats_image", theirs)
+    monkeypatch.setattr(gsplat_cuda, "_gsplats_image", Mock(side_effect=Theirs))
     for name in ("_kernels_run_on", "_compositing_runs_on"):
         monkeypatch.setattr(gsplat_cuda, name, lambda _: True)
     monkeypatch.setattr(torch_cpu, "composite", composite)

@@ -170,8 +170,8 @@ class TestOurKernels:
     def test_a_crowd(self, monkeypatch, side):
         """Around 130 splats in each tile: several batches, which hand light on."""
         draw_with_our_kernels(monkeypatch, "cuda", side)
-        larger = {"scales": lambda s: 4 * s, "opacities": lambda o: 0.2 * o}
-        check(for_our_kernels(_cloud(31, n=300, width=100, height=70, **larger)))
+        case = _cloud(31, n=300, width=100, height=70, scales=lambda s: 4 * s, opacities=lambda o: 0.2 * o)
+        check(for_our_kernels(case))
 
     @settings(max_examples=60, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
     @given(case=scenes().map(for_our_kernels), side=st.sampled_from([8, 16]))

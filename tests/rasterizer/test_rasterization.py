@@ -244,8 +244,7 @@ class TestOnCuda:
         from nrfgs_ns.rasterizer import gsplat_cuda
 
         monkeypatch.setattr(gsplat_cuda, "_compositing_runs_on", lambda _: False)
-        count = 5000
-        generator = torch.Generator().manual_seed(0)
+        count, generator = 5000, torch.Generator().manual_seed(0)
 
         def random(*shape: int) -> torch.Tensor:
             return torch.randn(*shape, generator=generator).cuda()
@@ -254,7 +253,6 @@ class TestOnCuda:
         tables[0][:, 2] += 6.0
         tables += [torch.sigmoid(random(count, 3)), torch.sigmoid(2 * random(count) - 1)]
         upstream = random(1, 200, 300, 3 if mode == "RGB" else 4)
-
         camera = torch.eye(4).cuda()[None], torch.tensor([[[200.0, 0, 150], [0, 200, 100], [0, 0, 1]]]).cuda(), 300, 200
 
         def render() -> tuple[list[torch.Tensor], int]:

@@ -17,17 +17,11 @@ PSNR = BY_NAME["PSNR"]
 
 
 def record(psnr, ssim=0.9, lpips=None, train=None, seconds=10.0, jobs=1, splats=1000, parts=1, device="a card"):
-    sizes = {"fps": 50.0, "splats": splats, "parameter_bytes": 2_000_000, "checkpoint_bytes": 6_000_000}
-    return {
-        "machine": {"device": device, "torch": "2.11"},
-        "jobs": jobs,
-        "train": {"seconds": seconds, "parts": parts, "splats": [[0, 100], [100, splats]]},
-        "measured": {
-            "test": {"psnr": psnr, "ssim": ssim, "ms_ssim": None, "l1": 0.01, "lpips": lpips},
-            "train": None if train is None else {"psnr": train},
-            **sizes,
-        },
-    }
+    test = {"psnr": psnr, "ssim": ssim, "ms_ssim": None, "l1": 0.01, "lpips": lpips}
+    measured = {"test": test, "train": None if train is None else {"psnr": train}, "fps": 50.0, "splats": splats}
+    measured |= {"parameter_bytes": 2_000_000, "checkpoint_bytes": 6_000_000}
+    trained = {"seconds": seconds, "parts": parts, "splats": [[0, 100], [100, splats]]}
+    return {"machine": {"device": device, "torch": "2.11"}, "jobs": jobs, "train": trained, "measured": measured}
 
 
 def test_ranks_share_and_skip_what_is_no_number():
