@@ -237,7 +237,7 @@ def _kernels_run_on(device: torch.device) -> None:
         tile_lists(ones[:, :2].contiguous(), radii, ones[0, :1], ones, ones[0, :1], 1, 1, side)
 
 
-@tried_once("Compositing of training images")
+@tried_once("Compositing of training images, which needs Triton 3.4 or newer,")
 def _compositing_runs_on(device: torch.device) -> None:
     """Whether the kernels of `compositing_triton.py` run on a device."""
     from .compositing_triton import CompositeSplats
