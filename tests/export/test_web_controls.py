@@ -379,5 +379,5 @@ def test_pictures_for_the_docs(demo, tmp_path):
     assert run.returncode == 0, run.stderr
     written = sorted(path.name for path in (tmp_path / "out").iterdir())
     shown = [f"{window}-{name}.jpg" for window in ("desktop", "phone") for name in ("page", "share", "view")]
-    assert written == [*shown, "web.jpg"]
+    assert written == [*shown, "swing.webp", "web.jpg"]
     assert all(np.asarray(Image.open(tmp_path / "out" / name)).std() > 5 for name in written)
