@@ -35,12 +35,13 @@ from nrfgs_ns.viewer.server import LocalViewerConfig
 with_methods()
 
 HALF_A_SPACING = 0.5
-"""Noise on where the field is asked from, in distances between neighbouring training cameras (docs/captures.md)."""
+"""Noise on where a head is asked from, in distances between neighbouring training cameras (docs/captures.md)."""
 
 SUITED = {
     "densification": ErrorGuided(),
     "dense_start": "auto",
     "near_plane": "auto",
+    "view_noise": HALF_A_SPACING,
     "shrinkage": 3.0,  # halved with every 12 training views
 }
 """The model's options that suit a training to its capture, whatever the head."""
@@ -97,7 +98,7 @@ nrfgs = preset(
     "nrfgs",
     method("nrfgs", NrfConfig(), "", latents=adam(0.0025), field=adam(5e-3, lr_final=5e-4)),
     "Gaussian splatting with a neural residual field for view-dependent colour and opacity.",
-    model={**SUITED, "view_noise": HALF_A_SPACING, "few_views": "auto"},
+    model={**SUITED, "few_views": "auto"},
     max_num_iterations=0,
 )
 
