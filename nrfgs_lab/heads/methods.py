@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The laboratory's methods: splatfacto's training, as the methods for comparison in `nrfgs_ns/method_config.py`."""
 
-from nrfgs_lab.heads.both import BothConfig
 from nrfgs_lab.heads.deferred import DeferredConfig
 from nrfgs_lab.heads.latent_spec import LatentSpecConfig
 from nrfgs_ns.method_config import adam, method
@@ -20,13 +19,4 @@ latent_spec = method(
     "For comparison: features of splats composited, and convolutions to two images (after Latent-SpecGS).",
     features=adam(0.0025),
     field=adam(1e-3, lr_final=1e-4),
-)
-
-both = method(
-    "nrfgs-both",
-    BothConfig(),
-    "The field at the splat, and a small network at the pixel.",
-    latents=adam(0.0025),
-    features=adam(0.0025),
-    field=adam(5e-3, lr_final=5e-4),
 )

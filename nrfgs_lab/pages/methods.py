@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Blocks of docs/comparison.md and docs/deviations.md: methods, their parts, and single differences from the papers."""
 
+from collections import defaultdict
 from statistics import fmean, median
 
 from nrfgs_lab.pages.few_views import ahead, cell, verdict
@@ -131,12 +132,6 @@ def at_equal_numbers() -> str:
     return grid(["", *scenes], body)
 
 
-def over(other: str) -> str:
-    """Verdicts on the field and another head with 150,000 splats."""
-    gains = {scene: view_gains(equal(scene, "field"), equal(scene, other)) for scene in CURVES}
-    return "; ".join(f"`{scene}` {verdict(views)}: {ahead(views)}" for scene, views in gains.items())
-
-
 def first_rule() -> str:
     """In how many pairs with another rule, at one number on one capture, growth by error is better and worse, and in
     how many its mean SSIM is higher."""
@@ -152,21 +147,47 @@ def first_rule() -> str:
 
 
 SEATS = {"field": "nrfgs", "harmonics": "nrfgs-sh", "network at the pixel": "nrfgs-deferred"}
-SEATS["convolutions at the pixel"] = "nrfgs-latent-spec"
-"""Run -> its method in a record of costs."""
+SEATS |= {"convolutions at the pixel": "nrfgs-latent-spec", "field and network at the pixel": ""}
+"""Run -> its method in a record of costs, if it has one."""
+
+
+def seated(scene: str, run: str) -> Trainings:
+    """A run of the plan `test-views` of pixel.yaml."""
+    return trainings("rates", scene, run.replace(" ", "_"), f"{BY_ERROR}@{COUNTS[1]}")
+
+
+def over(other: str, run: str = "field") -> str:
+    """Verdicts on a run and another head with 150,000 splats."""
+    gains = {scene: view_gains(seated(scene, run), seated(scene, other)) for scene in (*CURVES, "castle")}
+    return "; ".join(f"`{scene}` {verdict(views)}: {ahead(views)}" for scene, views in gains.items() if views)
+
+
+def rates(head: str) -> str:
+    """The settings chosen for a head at the pixel: of each knob the best, with its mean gain over captures in dB."""
+    tried: dict[str, dict[str, float]] = defaultdict(dict)
+    for name, one in records("rates").items():
+        if name.startswith(f"{head}/"):
+            tried[one["cell"]["run"]][one["cell"]["scene"]] = one["measured"]["test"]["psnr"]
+    plain, best = tried.pop("default"), {}
+    for run, psnr in tried.items():
+        knob, _, setting = run.partition(" ")
+        won = fmean(psnr[scene] - plain[scene] for scene in plain)
+        best[knob] = max(best.get(knob, (0.1, "")), (won, setting))
+    return ", ".join(f"{setting} {signed(won, 2)}" for won, setting in best.values() if setting)
 
 
 def seats() -> str:
     """Quality, cost and stillness of networks at the splat and at the pixel."""
     costs, body = records("numbers"), []
     for run, method in SEATS.items():
-        turns, large = [costs[f"cost/{method}/0.4/{turn}"] for turn in (0, 1)], costs[f"cost/{method}/2.0/0"]
-        small = {name: fmean(one[name] for one in turns) for name in ("step_ms", "1080p", "4K")}
-        still = costs[f"flicker/{run}/bonsai"]
-        quality = [cell(equal(scene, run)) for scene in (*CURVES, "castle")]
-        cost = f"{small['step_ms']:.1f}/{large['step_ms']:.1f}", f"{large['peak_mb'] / 1000:.1f}"
-        frames, calm = f"{small['1080p']:.0f}/{small['4K']:.0f}", f"{still['flicker']:.2f}"
-        body.append([run, *quality, *cost, frames, calm, f"{still['psnr']['2']:.1f}"])
+        row = [run, *(cell(seated(scene, run)) for scene in (*CURVES, "castle"))]
+        if method:
+            turns, large = [costs[f"cost/{method}/0.4/{turn}"] for turn in (0, 1)], costs[f"cost/{method}/2.0/0"]
+            small = {name: fmean(one[name] for one in turns) for name in ("step_ms", "1080p", "4K")}
+            still = costs[f"flicker/{run}/bonsai"]
+            row += [f"{small['step_ms']:.1f}/{large['step_ms']:.1f}", f"{large['peak_mb'] / 1000:.1f}"]
+            row += [f"{small['1080p']:.0f}/{small['4K']:.0f}", f"{still['flicker']:.2f}", f"{still['psnr']['2']:.1f}"]
+        body.append(row + [""] * (10 - len(row)))
     cost = "ms of a step, 0.4/2 MP", "GB at 2 MP", "frames a second, 1080p/4K"
     return grid(["", *CURVES, "castle", *cost, "flicker", "twice the size, dB"], body)
 
@@ -229,6 +250,6 @@ def noise() -> str:
 
 BLOCKS = {
     **{f"comparison.{block.__name__}": block for block in (every, parts, over_gsnb, chosen)},
-    **{f"equal.{block.__name__}": block for block in (at_equal_numbers, over, first_rule, seats)},
+    **{f"equal.{block.__name__}": block for block in (at_equal_numbers, over, rates, first_rule, seats)},
     **{f"deviations.{block.__name__}": block for block in (worth, noise)},
 }
