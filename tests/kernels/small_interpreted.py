@@ -18,6 +18,7 @@ from nrfgs_ns.densification.statistics_triton import add, raise_maxima
 from nrfgs_ns.image import ssim_triton
 from nrfgs_ns.image.ssim import photometric_loss
 from nrfgs_ns.rasterizer import TILE_SIZE, gsplat_cuda
+from nrfgs_ns.rasterizer import tile_lists as tile_lists_module
 from nrfgs_ns.rasterizer.tile_lists import FixedRoom, tile_lists
 
 
@@ -86,6 +87,25 @@ def test_tiles_list_what_draws_in_them(shape):
     assert assert_lists(*lists, of, *shape, TILE_SIZE) <= 0.1 * len(lists[1])
 
 
+@pytest.mark.parametrize("shape", [(13, 9, 8), (12, 8, 8)])
+def test_split_lists_are_those_of_tiles_of_their_size(monkeypatch, shape):
+    """Split in batches that end inside of a tile's list, and with room to spare."""
+    monkeypatch.setattr(tile_lists_module, "BATCH", 16)
+    of, room = splats(200, 100, 70), FixedRoom(2000, torch.device("cpu"))
+    for mine, twin in zip(tile_lists(*of, *shape, room=room, split=True), tile_lists(*of, *shape), strict=True):
+        assert mine.dtype == twin.dtype and torch.equal(mine.flatten()[: twin.numel()], twin.flatten())
+
+
+def test_whole_batches_in_each_quarter():
+    """Splats that draw everywhere in a tile and a half, in two batches and a part of one."""
+    many = 2 * tile_lists_module.BATCH + 5
+    wide = torch.full((many, 2), 12.0), torch.full((many,), 90, dtype=torch.int32), torch.rand(many)
+    of = Splats(*wide, torch.tensor([[1e-4, 0.0, 1e-4]]).repeat(many, 1), torch.ones(many))
+    begins, rows = tile_lists(*of, 3, 2, 8, split=True)
+    assert begins.flatten().tolist() == [*range(0, 6 * many, many), *[6 * many] * 3]
+    assert torch.equal(rows[: 6 * many].view(6, many), of.depths.argsort().int().expand(6, many))
+
+
 def test_the_most_tiles():
     """A splat in the last tile of row 249, of 256 with the row below the image."""
     one = torch.ones(1)
@@ -140,15 +160,12 @@ def check(case):
     assert_agrees(judge(case, grads), evaluate(rasterization, case, grads, "cpu"))
 
 
-@pytest.mark.parametrize("name", ["opaque_layers", "larger_than_image", "needles", "opacities_0_to_1", "capped"])
+@pytest.mark.parametrize(
+    "name", ["opaque_layers", "larger_than_image", "needles", "opacities_0_to_1", "capped", "antialiased"]
+)
 def test_hard_cases(ours, name):
     """Together more splats in a tile than a batch, light that runs out, alphas at both cut-offs and at the cap."""
     check(for_our_kernels(CASES[name]()))
-
-
-def test_tiles_of_several_blocks(ours, monkeypatch):
-    monkeypatch.setattr(gsplat_cuda, "SMALL_TILE", 16)
-    check(for_our_kernels(CASES["antialiased"]()))
 
 
 @settings(max_examples=12, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
