@@ -37,8 +37,8 @@ SPLATS = 64
 """Splats whose tiles one program counts; a power of two."""
 PAIRS = 256
 """Pairs of a splat and a tile that one program lists; a power of two."""
-BATCH = 128
-"""Pairs that one program splits at a time; a power of two below 256."""
+BATCH = 256
+"""Pairs that one program splits at a time; a power of two, at most 2^15."""
 BITS = tl.constexpr(28)
 """Bits of a pair's splat; the four above are for the tile's quarters, row by row."""
 GSPLATS = tl.constexpr(TILE_SIZE)
@@ -194,11 +194,12 @@ def split_kernel(begins, splats, places, lists, width, height, BATCH: tl.constex
     for start in range(tl.load(begins + tile), end, BATCH):
         at = start + tl.arange(0, BATCH)[None, :]
         splat = tl.load(splats + at, mask=at < end, other=0)
-        draws = (splat >> BITS & 15) * 0x204081 & 0x1010101  # a byte for each quarter, so that one scan counts in all
+        # A quarter's bit moves to 16 bits of its own, so that one sum counts in all quarters.
+        draws = (splat >> BITS & 15).to(tl.int64) * 0x200040008001 & 0x1000100010001
         if not COUNT:
-            before = tl.cumsum(draws, 1) - draws >> 8 * quarter & 255
-            tl.store(lists + (place + before), splat & 0xFFFFFFF, mask=inside & (draws >> 8 * quarter & 255 > 0))
-        place += tl.sum(draws, axis=1, keep_dims=True) >> 8 * quarter & 255
+            before = tl.cumsum(draws, 1) - draws >> 16 * quarter & 0xFFFF
+            tl.store(lists + (place + before), splat & 0xFFFFFFF, mask=inside & (draws >> 16 * quarter & 1 > 0))
+        place += (tl.sum(draws, axis=1, keep_dims=True) >> 16 * quarter & 0xFFFF).to(tl.int32)
     if COUNT:
         tl.store(places + 1, place, mask=inside)
 
@@ -334,9 +335,9 @@ def tile_lists(
     if not split:
         return begins.view(1, height + 1, width), rows
     places, lists = rows.new_zeros(size[1] + 1, size[0]), rows.new_empty(4 * pairs)
-    launch_split((width, height, 1), begins, rows, places, lists, *size, BATCH=BATCH, COUNT=True, num_warps=1)
+    launch_split((width, height, 1), begins, rows, places, lists, *size, BATCH=BATCH, COUNT=True, num_warps=2)
     places = places.flatten().cumsum(0, dtype=torch.int32).view(1, *places.shape)
-    launch_split((width, height, 1), begins, rows, places, lists, *size, BATCH=BATCH, COUNT=False, num_warps=1)
+    launch_split((width, height, 1), begins, rows, places, lists, *size, BATCH=BATCH, COUNT=False, num_warps=2)
     return places, lists
 
 
