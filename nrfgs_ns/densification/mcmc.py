@@ -9,14 +9,7 @@ import torch
 from torch import Tensor
 
 from nrfgs_ns.densification.relocation import add_noise, add_samples, relocate
-from nrfgs_ns.densification.strategy import (
-    CHANGE,
-    Densification,
-    DensificationConfig,
-    OpacitySeen,
-    Optimizers,
-    Splats,
-)
+from nrfgs_ns.densification.strategy import CHANGE, Densification, DensificationConfig, OpacitySeen, Optimizers, Splats
 
 LARGEST_BUDGET = 2**24
 """`torch.multinomial` draws from no more categories than this."""

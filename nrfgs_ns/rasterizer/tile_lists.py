@@ -22,7 +22,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cache
 
 import torch
 import triton
@@ -330,7 +329,7 @@ def tile_lists(
             PAIRS=PAIRS, SIDE=side, RADII=axes, SPLIT=split, num_warps=4,
         )  # fmt: skip
     tiles, by_tile = torch.sort(tiles, stable=True)
-    numbers = _numbers(width * (height + 1), device)
+    numbers = torch.arange(FIRST.value, FIRST.value + width * (height + 1), dtype=torch.int16, device=device)
     begins, rows = torch.searchsorted(tiles, numbers, out_int32=True), rows.index_select(0, by_tile)
     if not split:
         return begins.view(1, height + 1, width), rows
@@ -339,10 +338,3 @@ def tile_lists(
     places = places.flatten().cumsum(0, dtype=torch.int32).view(1, *places.shape)
     launch_split((width, height, 1), begins, rows, places, lists, *size, BATCH=BATCH, COUNT=False, num_warps=2)
     return places, lists
-
-
-@cache  # for good: recorded steps read it
-def _numbers(count: int, device: torch.device) -> Tensor:
-    """Of the first `count` tiles."""
-    with torch.inference_mode(False):  # they outlive a rendering that records nothing
-        return torch.arange(FIRST.value, FIRST.value + count, dtype=torch.int16, device=device)

@@ -96,16 +96,6 @@ def test_split_lists_are_those_of_tiles_of_their_size(monkeypatch, shape):
         assert mine.dtype == twin.dtype and torch.equal(mine.flatten()[: twin.numel()], twin.flatten())
 
 
-def test_whole_batches_in_each_quarter():
-    """Splats that draw everywhere in a tile and a half, in two batches and a part of one."""
-    many = 2 * tile_lists_module.BATCH + 5
-    wide = torch.full((many, 2), 12.0), torch.full((many,), 90, dtype=torch.int32), torch.rand(many)
-    of = Splats(*wide, torch.tensor([[1e-4, 0.0, 1e-4]]).repeat(many, 1), torch.ones(many))
-    begins, rows = tile_lists(*of, 3, 2, 8, split=True)
-    assert begins.flatten().tolist() == [*range(0, 6 * many, many), *[6 * many] * 3]
-    assert torch.equal(rows[: 6 * many].view(6, many), of.depths.argsort().int().expand(6, many))
-
-
 def test_the_most_tiles():
     """A splat in the last tile of row 249, of 256 with the row below the image."""
     one = torch.ones(1)
