@@ -272,5 +272,4 @@ def _folds(K: np.ndarray, distortion: np.ndarray, size: tuple[int, int], flat: n
     taken = taken.reshape(*u.shape, 2)
     across, down = np.diff(taken, axis=1)[:-1], np.diff(taken, axis=0)[:, :-1]
     in_order = across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0] > 0
-    beside = np.abs(taken / size - 0.5).max() > 0.5 + MARGIN
-    return beside or not in_order.all()
+    return np.abs(taken / size - 0.5).max() > 0.5 + MARGIN or not in_order.all()

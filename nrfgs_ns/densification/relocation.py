@@ -48,8 +48,7 @@ def split_evenly(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Ten
     k = torch.arange(MAX_COPIES, device=o.device)
     signs = (1.0 - 2.0 * (k % 2)) / (k + 1.0).sqrt()
     terms = _BINOMIALS.to(o.device)[n] * signs * each[:, None] ** (k + 1)  # [M, 51]
-    factor = o / terms.sum(dim=-1)
-    return each.to(opacities.dtype), (factor[:, None] * scales).to(scales.dtype)
+    return each.to(opacities.dtype), ((o / terms.sum(dim=-1))[:, None] * scales).to(scales.dtype)
 
 
 _BINOMIALS = torch.tensor(

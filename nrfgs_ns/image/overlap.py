@@ -186,9 +186,7 @@ def slope(pairs: Pairs, known: Tensor) -> float:
     expected = known[pairs.second] - known[pairs.first]
     both = torch.isfinite(expected) & (expected.abs() > 0)
     expected, seen = expected[both].double(), pairs.shift[both, 0].double()
-    if len(seen) < 3:
-        return 1.0
-    return min(max(float((expected * seen).sum() / expected.square().sum()), 0.0), 1.0)
+    return 1.0 if len(seen) < 3 else min(max(float((expected * seen).sum() / expected.square().sum()), 0.0), 1.0)
 
 
 class Looks(NamedTuple):

@@ -327,9 +327,7 @@ class NrfgsModel(ExportedModel):
 
     def mask_of(self, batch: Mapping[str, Any]) -> Tensor | None:
         """The image's mask at the rendered size, bool [H, W, 1], or None. Half-covered pixels are inside."""
-        if "mask" not in batch:
-            return None
-        return self._downscale_if_required(batch["mask"]).to(self.device) >= 0.5
+        return self._downscale_if_required(batch["mask"]).to(self.device) >= 0.5 if "mask" in batch else None
 
     def step_post_backward(self, step: int) -> None:
         assert step == self.step

@@ -38,8 +38,6 @@ PAIRS = 256
 """Pairs of a splat and a tile that one program lists; a power of two."""
 BATCH = 256
 """Pairs that one program splits at a time; a power of two, at most 2^15."""
-BITS = tl.constexpr(28)
-"""Bits of a pair's splat; the four above are for the tile's quarters, row by row."""
 GSPLATS = tl.constexpr(TILE_SIZE)
 """Side of gsplat's tiles in pixels."""
 FIRST = tl.constexpr(-(2**15))
@@ -142,8 +140,9 @@ def list_kernel(
     means2d, conics, opacities, radii, order, ends, tiles, splats, count, pairs, width, height,
     PAIRS: tl.constexpr, SIDE: tl.constexpr, RADII: tl.constexpr, SPLIT: tl.constexpr,
 ):  # fmt: skip
-    """The tile and the splat of each pair, splats in `order`; with SPLIT, the tile's quarters too. Pairs beyond the
-    last, and those that rounding has left without a tile, get a tile below the image."""
+    """The tile and the splat of each pair, splats in `order`; with SPLIT, the upper four of the splat's 32 bits are for
+    the tile's quarters, row by row. Pairs beyond the last, and those that rounding has left without a tile, get a tile
+    below the image."""
     at = tl.program_id(0) * PAIRS + tl.arange(0, PAIRS)
     valid = at < pairs
     real = at < tl.load(ends + (count - 1))
@@ -174,7 +173,7 @@ def list_kernel(
         for quarter in tl.static_range(4):
             row, column = tile // width * 2 + quarter // 2, tile % width * 2 + quarter % 2
             first, end = _columns(row, x, y, a, b, c, bound, det, left * 2, right * 2, SIDE // 2)
-            rows |= ((first <= column) & (column < end)).to(tl.int32) << (quarter + BITS)
+            rows |= ((first <= column) & (column < end)).to(tl.int32) << (quarter + 28)
     tl.store(tiles + at, (tile + FIRST).to(tl.int16), mask=valid)
     tl.store(splats + at, rows, mask=valid)
 
@@ -194,7 +193,7 @@ def split_kernel(begins, splats, places, lists, width, height, BATCH: tl.constex
         at = start + tl.arange(0, BATCH)[None, :]
         splat = tl.load(splats + at, mask=at < end, other=0)
         # A quarter's bit moves to 16 bits of its own, so that one sum counts in all quarters.
-        draws = (splat >> BITS & 15).to(tl.int64) * 0x200040008001 & 0x1000100010001
+        draws = (splat >> 28 & 15).to(tl.int64) * 0x200040008001 & 0x1000100010001
         if not COUNT:
             before = tl.cumsum(draws, 1) - draws >> 16 * quarter & 0xFFFF
             tl.store(lists + (place + before), splat & 0xFFFFFFF, mask=inside & (draws >> 16 * quarter & 1 > 0))
@@ -321,8 +320,7 @@ def tile_lists(
     else:
         room.send(ends[-1:])
         pairs = room.pairs
-    tiles = torch.empty(pairs, dtype=torch.int16, device=device)
-    rows = torch.empty(pairs, dtype=torch.int32, device=device)
+    tiles, rows = (torch.empty(pairs, dtype=dtype, device=device) for dtype in (torch.int16, torch.int32))
     if pairs > 0:
         launch_list(
             (-(-pairs // PAIRS), 1, 1), *splats, ends, tiles, rows, count, pairs, width, height,

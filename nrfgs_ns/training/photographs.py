@@ -75,8 +75,7 @@ def photograph_model(config: Any, datamanager: Any) -> PhotographModel | None:
     if not wanted:
         return None
     looks = estimate(pairs, exif, centers) if torch.isfinite(exif).any() else known.seen
-    names = [path.name for path in dataset.image_filenames]
-    return PhotographModel(names, looks.stops, looks.held)
+    return PhotographModel([path.name for path in dataset.image_filenames], looks.stops, looks.held)
 
 
 def check_same_photographs(own: PhotographModel | None, written: Mapping[str, Any] | None) -> None:

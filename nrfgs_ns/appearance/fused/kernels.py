@@ -50,10 +50,7 @@ LOGIT_SLOPE = tl.constexpr(4.0)  # nrf.LOGIT_SLOPE
 @triton.jit
 def _view(means, centers, rows, items, lanes, eps_squared, log_unit, B: tl.constexpr, ONE_CENTER: tl.constexpr):
     """encoding.view_geometry: direction (lane 3 is 0); log r in scene units, 1 / r and |v| above the floor, [B, 1]."""
-    if ONE_CENTER:
-        center = tl.load(centers + lanes, mask=lanes < 3, other=0.0)
-    else:
-        center = load_three(centers, items, lanes, B)
+    center = tl.load(centers + lanes, mask=lanes < 3, other=0.0) if ONE_CENTER else load_three(centers, items, lanes, B)
     v = center - load_three(means, rows, lanes, B)
     v = tl.minimum(tl.maximum(v, -FARTHEST, tl.PropagateNan.ALL), FARTHEST, tl.PropagateNan.ALL)
     square = tl.sum(v * v, axis=1)[:, None]
@@ -233,10 +230,7 @@ def backward_kernel(
     W2_T = tl.load(second + units[:, None] * OUTPUTS + sixteen[None, :], mask=sixteen[None, :] < OUTPUTS, other=0.0)
     W2_T = tl.trans(operand(W2_T, GRADIENT_KIND))
     b2 = tl.load(second + H * OUTPUTS + outputs, mask=real, other=0.0)
-    if COLUMNS == 8:
-        d_W1 = tl.zeros((H, 2 * P), tl.float32)
-    else:
-        d_W1 = tl.zeros((2 * P, H), tl.float32)
+    d_W1 = tl.zeros((H, 2 * P), tl.float32) if COLUMNS == 8 else tl.zeros((2 * P, H), tl.float32)
     d_W2 = tl.zeros((H, COLUMNS), tl.float32)
     d_b2_low, d_b2_high = tl.zeros((B, 4), tl.float32), tl.zeros((B, 4), tl.float32)
     d_center = tl.zeros((B, 4), tl.float32)

@@ -137,8 +137,7 @@ def _clip(spans: Tensor, block: Block) -> Tensor:
     """Spans within a block, with an empty range of rows for splats outside. [4, F]"""
     row0, row1 = spans[0].clamp(min=block.row0), spans[1].clamp(max=block.row1)
     col0, col1 = spans[2].clamp(min=block.col0), spans[3].clamp(max=block.col1)
-    row1 = torch.where(col0 < col1, row1.maximum(row0), row0)
-    return torch.stack([row0, row1, col0, col1])
+    return torch.stack([row0, torch.where(col0 < col1, row1.maximum(row0), row0), col0, col1])
 
 
 def split_into_blocks(prints: Footprints, max_pairs: int) -> list[Block]:
