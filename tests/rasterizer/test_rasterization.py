@@ -18,8 +18,7 @@ from nrfgs_ns.rasterizer.torch_cpu.tiles import SUB_TILE, footprints, list_tiles
 
 
 def test_info_has_gsplats_keys():
-    case = CASES["ordinary"]()
-    _, _, info = rasterization(*case.arguments())
+    _, _, info = rasterization(*CASES["ordinary"]().arguments())
     assert set(info) == {
         *("camera_ids", "gaussian_ids", "radii", "means2d", "depths", "conics", "opacities"),
         *("tile_width", "tile_height", "width", "height", "tile_size", "n_cameras"),
