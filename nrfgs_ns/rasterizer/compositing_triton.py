@@ -3,8 +3,8 @@
 
 gsplat's threads are pixels: what they add to a splat's gradient is summed over a warp by shuffles, nine numbers for
 each splat. Here threads are splats, as in the backward pass of Mallick et al., Taming 3DGS (2024). A program, of one
-warp, has a block of pixels and goes through its tile's list in batches of LANES x EACH splats. A thread has EACH of
-them, and sums over its columns of the block in registers. In return, the light that is left is a scan over the lanes.
+warp, has a tile and goes through the tile's list in batches of LANES x EACH splats. A thread has EACH of them, and sums
+over its columns of the tile in registers. In return, the light that is left is a scan over the lanes.
 
 Splat k covers a pixel with alpha_k = min(0.999, o_k exp(-sigma_k)), counted as 0 below 1/255 or where sigma_k < 0. The
 light behind it is T_k = T_{k-1} (1 - alpha_k), T_0 = 1. The first splat that would bring T_k to 1e-4 or below ends the
@@ -34,7 +34,7 @@ from torch.autograd.function import once_differentiable
 from nrfgs_ns.kernels.launch import Launcher
 
 BLOCK = tl.constexpr(8)
-"""Side of a program's pixels, which divides a tile's."""
+"""Side of a tile in pixels."""
 LANES = tl.constexpr(8)
 """Threads of a warp along the list; a power of two."""
 EACH = tl.constexpr(4)
@@ -71,11 +71,10 @@ def _lane(values, lane):
 
 
 @triton.jit
-def _block(side, columns):
-    """This program's number and its tile's; columns [BLOCK, 1] and first row of its pixels."""
-    column, row = tl.program_id(0) * BLOCK, tl.program_id(1) * BLOCK
-    program = tl.program_id(1) * tl.num_programs(0) + tl.program_id(0)
-    return program, row // side * columns + column // side, column + tl.arange(0, BLOCK)[:, None], row
+def _tile():
+    """This program's tile; columns [BLOCK, 1] and first row of its pixels."""
+    tile = tl.program_id(1) * tl.num_programs(0) + tl.program_id(0)
+    return tile, tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)[:, None], tl.program_id(1) * BLOCK
 
 
 @triton.jit
@@ -132,12 +131,12 @@ def _blend(splats, row, left):
     return shown, drawn, weights, last, left * _lane(scan, LANES - 1)
 
 
-@triton.jit(do_not_specialize=["width", "height", "side", "columns"])
+@triton.jit(do_not_specialize=["width", "height"])
 def forward_kernel(
-    begins, ids, means2d, conics, opacities, colors, background, render, alphas, ends, width, height, side, columns
-):
+    begins, ids, means2d, conics, opacities, colors, background, render, alphas, ends, width, height
+):  # fmt: skip
     """Image [height, width, 3] over a background, A [height, width], and where each program has ended in its list."""
-    program, tile, column, top = _block(side, columns)
+    tile, column, top = _tile()
     none = tl.zeros((BLOCK, LANES), tl.float32)
     rows = ()
     for row in tl.static_range(BLOCK):
@@ -159,7 +158,7 @@ def forward_kernel(
         at += LANES * EACH
         # As an integer, of the whole warp: one instruction, after which the compiler knows that threads stay together.
         live = tl.max((most_left > MIN_TRANSMITTANCE).to(tl.int32))
-    tl.store(ends + program, tl.minimum(at, end))
+    tl.store(ends + tile, tl.minimum(at, end))
     for row in tl.static_range(BLOCK):
         pixel, inside = _pixels(top + row, column, width, height)
         alpha = tl.sum(rows[row][4], axis=1, keep_dims=True)
@@ -169,13 +168,13 @@ def forward_kernel(
             tl.store(render + pixel * 3 + i, tl.fma(1.0 - alpha, tl.load(background + i), color), mask=inside)
 
 
-@triton.jit(do_not_specialize=["width", "height", "side", "columns"])
+@triton.jit(do_not_specialize=["width", "height"])
 def backward_kernel(
     begins, ids, means2d, conics, opacities, colors, render, alphas, ends, d_render, d_alphas,
-    d_means2d, d_conics, d_opacities, d_colors, absgrad, width, height, side, columns, ABSGRAD: tl.constexpr,
+    d_means2d, d_conics, d_opacities, d_colors, absgrad, width, height, ABSGRAD: tl.constexpr,
 ):  # fmt: skip
     """Add the gradients of the forward pass's tables to tables of zeros, from its results and their gradients."""
-    program, tile, column, top = _block(side, columns)
+    tile, column, top = _tile()
     none = tl.zeros((BLOCK, LANES), tl.float32)
     left, worth = (), ()  # T and R of the block's rows, the next one's first
     for step in tl.static_range(BLOCK):
@@ -187,7 +186,7 @@ def backward_kernel(
             value = tl.fma(upstream[i], rgb[i], value)
         left, worth = left + (tl.where(inside, 1.0, none),), worth + (value + none,)
     end = tl.load(begins + tile + 1)
-    for at in range(tl.load(begins + tile), tl.load(ends + program), LANES * EACH):
+    for at in range(tl.load(begins + tile), tl.load(ends + tile), LANES * EACH):
         splats = _batch(ids, at, end, column, means2d, conics, opacities, colors)
         sums = ()
         for _k in tl.static_range(EACH):
@@ -238,19 +237,18 @@ launch_forward, launch_backward = Launcher(forward_kernel), Launcher(backward_ke
 class CompositeSplats(torch.autograd.Function):
     """(means2d, conics, opacities, colors, background [1, 3]) -> (render [1, H, W, 3], alphas [1, H, W, 1]).
 
-    All tensors are contiguous; `begins` and `ids` are `tile_lists`'s, `shape` is width, height and the tiles' side in
-    pixels. With `absgrad` the backward pass leaves sum |dL/dmean2d| over pixels in `means2d.absgrad`.
+    All tensors are contiguous; `begins` and `ids` are `tile_lists`'s for tiles of BLOCK pixels, `shape` is width and
+    height. With `absgrad` the backward pass leaves sum |dL/dmean2d| over pixels in `means2d.absgrad`.
     """
 
     @staticmethod
     def forward(ctx, means2d, conics, opacities, colors, background, begins, ids, shape: tuple, absgrad: bool):
-        width, height, _ = shape
-        ctx.absgrad, ctx.numbers = absgrad, (*shape, begins.shape[2])
-        ctx.grid = (-(-width // BLOCK.value), -(-height // BLOCK.value), 1)
+        width, height = ctx.shape = shape
+        ctx.absgrad, ctx.grid = absgrad, (begins.shape[2], begins.shape[1] - 1, 1)
         render, alphas = means2d.new_empty(1, height, width, 3), means2d.new_empty(1, height, width, 1)
         tables = begins, ids, means2d, conics, opacities, colors
         results = render, alphas, ids.new_empty(ctx.grid[0] * ctx.grid[1])
-        launch_forward(ctx.grid, *tables, background, *results, *ctx.numbers, num_warps=1)
+        launch_forward(ctx.grid, *tables, background, *results, *shape, num_warps=1)
         ctx.save_for_backward(*tables, *results)
         return render, alphas
 
@@ -260,7 +258,7 @@ class CompositeSplats(torch.autograd.Function):
         _, _, *tables, _, alphas, _ = saved = ctx.saved_tensors
         gradients = [torch.zeros_like(table) for table in tables]
         absgrad = torch.zeros_like(tables[0]) if ctx.absgrad else alphas
-        arguments = *saved, d_render.contiguous(), d_alphas.contiguous(), *gradients, absgrad, *ctx.numbers
+        arguments = *saved, d_render.contiguous(), d_alphas.contiguous(), *gradients, absgrad, *ctx.shape
         launch_backward(ctx.grid, *arguments, ABSGRAD=ctx.absgrad, num_warps=1)
         if ctx.absgrad:
             tables[0].absgrad = absgrad

@@ -132,20 +132,19 @@ def composite(
     Args:
         leave_out: do not draw rows that are not finite; only if `leaves_out` allows it.
     """
-    side, room, draw = TILE_SIZE, None, _gsplats_image
+    side, room, ours = TILE_SIZE, None, False
     if len(opacities) > 0 and _kernels_take(projection, opacities):
         from .tile_lists import room_on
 
         room = room_on(opacities.device)
-        if torch.is_grad_enabled() and _tiles(projection, SMALL_TILE) <= MOST_TILES:
-            side = SMALL_TILE
-        if torch.is_grad_enabled() and colors.shape[1] == 3 and _compositing_runs_on(colors.device):
-            draw = _our_image
+        if torch.is_grad_enabled():
+            ours = colors.shape[1] == 3 and _compositing_runs_on(colors.device)
+            side = SMALL_TILE if ours or _tiles(projection, SMALL_TILE) <= MOST_TILES else TILE_SIZE
     tables = projection.means2d, projection.conics, colors, opacities
     shape = projection.width, projection.height, side
     while True:
-        lists = _lists(projection, opacities, side, room, colors if leave_out else None)
-        render, alphas = draw(tables, backgrounds, shape, lists, absgrad)
+        lists = _lists(projection, opacities, side, room, colors if leave_out else None, ours)
+        render, alphas = (_our_image if ours else _gsplats_image)(tables, backgrounds, shape, lists, absgrad)
         if room is None or room.was_enough():
             return render, alphas, {"isect_offsets": lists[0], "flatten_ids": lists[1], "tile_size": side}
 
@@ -171,7 +170,7 @@ def _our_image(
 
     means2d, conics, colors, opacities = (table.contiguous() for table in tables)
     background = colors.new_zeros(1, 3) if backgrounds is None else backgrounds.to(colors.dtype).contiguous()
-    return CompositeSplats.apply(means2d, conics, opacities, colors, background, *lists, shape, absgrad)
+    return CompositeSplats.apply(means2d, conics, opacities, colors, background, *lists, shape[:2], absgrad)
 
 
 def leaves_out(projection: Projection, colors: Tensor, opacities: Tensor) -> bool:
@@ -181,7 +180,7 @@ def leaves_out(projection: Projection, colors: Tensor, opacities: Tensor) -> boo
 
 
 def _lists(
-    projection: Projection, opacities: Tensor, side: int, room: Room | None, finite: Tensor | None
+    projection: Projection, opacities: Tensor, side: int, room: Room | None, finite: Tensor | None, split: bool
 ) -> tuple[Tensor, Tensor]:
     """Offsets into a list of rows, and the list: the splats that each tile draws, as gsplat's kernels take them.
 
@@ -189,6 +188,7 @@ def _lists(
         side: of a tile, in pixels.
         room: for the kernels of `tile_lists.py`; None: gsplat makes the lists.
         finite: colours [M, D]; rows that are not finite, in these or otherwise, are left out.
+        split: for our compositing alone; see `tile_lists`.
     """
     tile_width, tile_height = -(-projection.width // side), -(-projection.height // side)
     bounds = projection.radii
@@ -201,7 +201,7 @@ def _lists(
 
         tables = (table.detach().contiguous() for table in (means2d, bounds, depths, conics, opacities))
         colors = None if finite is None else finite.detach().contiguous()
-        return tile_lists(*tables, tile_width, tile_height, side, colors, room)
+        return tile_lists(*tables, tile_width, tile_height, side, colors, room, split)
     images = {"n_cameras": projection.n_cameras, "camera_ids": projection.camera_ids}
     if HAS_BATCHES:
         images = {"n_images": projection.n_cameras, "image_ids": projection.camera_ids}
@@ -229,21 +229,25 @@ def _tiles(projection: Projection, side: int) -> int:
 @tried_once("The list of each tile's splats")
 def _kernels_run_on(device: torch.device) -> None:
     """Whether the kernels of `tile_lists.py` run on a device."""
-    from .tile_lists import tile_lists
-
-    ones = torch.ones(1, 3, device=device)
-    radii = torch.ones(1, 2, dtype=torch.int32, device=device) if HAS_BATCHES else ones[0, :1].int()
     for side in (SMALL_TILE, TILE_SIZE):
-        tile_lists(ones[:, :2].contiguous(), radii, ones[0, :1], ones, ones[0, :1], 1, 1, side)
+        _lists_of_one(device, side)
 
 
 @tried_once("Compositing of training images, which needs Triton 3.4 or newer,")
 def _compositing_runs_on(device: torch.device) -> None:
-    """Whether the kernels of `compositing_triton.py` run on a device."""
+    """Whether the kernels of `compositing_triton.py`, and that which splits lists, run on a device."""
     from .compositing_triton import CompositeSplats
 
-    leaf = torch.ones(1, 3, device=device, requires_grad=True)
-    begins = torch.tensor([[[0], [1]]], dtype=torch.int32, device=device)
+    lists, leaf = _lists_of_one(device, SMALL_TILE, split=True), torch.ones(1, 3, device=device, requires_grad=True)
     for absgrad in (False, True):
         tables = leaf[:, :2].contiguous(), leaf * 1, leaf[:, 0].contiguous(), leaf * 1, torch.zeros_like(leaf)
-        CompositeSplats.apply(*tables, begins, begins[0, 0], (1, 1, SMALL_TILE), absgrad)[0].sum().backward()
+        CompositeSplats.apply(*tables, *lists, (1, 1), absgrad)[0].sum().backward()
+
+
+def _lists_of_one(device: torch.device, side: int, split: bool = False) -> tuple[Tensor, Tensor]:
+    """The list of an image's only tile, of one splat."""
+    from .tile_lists import tile_lists
+
+    ones = torch.ones(1, 3, device=device)
+    radii = torch.ones(1, 2, dtype=torch.int32, device=device) if HAS_BATCHES else ones[0, :1].int()
+    return tile_lists(ones[:, :2].contiguous(), radii, ones[0, :1], ones, ones[0, :1], 1, 1, side, split=split)

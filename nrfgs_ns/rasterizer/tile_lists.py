@@ -13,7 +13,8 @@ An ellipse meets a row of tiles in one interval of columns, which ends at the el
 points, or, where these lie outside the row's band, on the band's nearer edge.
 
 Splats are sorted by depth, then listed in that order; a stable sort by tile does the rest, to gsplat's last tie. 16-bit
-tile numbers take a quarter of the passes of its 64-bit keys.
+tile numbers take a quarter of the passes of its 64-bit keys. Tiles of half the side have twice the pairs: instead, four
+bits of a pair can say in which quarters of its tile it draws, and the tile's list is split behind the sort.
 """
 
 from __future__ import annotations
@@ -21,7 +22,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cache
 
 import torch
 import triton
@@ -36,6 +36,8 @@ SPLATS = 64
 """Splats whose tiles one program counts; a power of two."""
 PAIRS = 256
 """Pairs of a splat and a tile that one program lists; a power of two."""
+BATCH = 256
+"""Pairs that one program splits at a time; a power of two, at most 2^15."""
 GSPLATS = tl.constexpr(TILE_SIZE)
 """Side of gsplat's tiles in pixels."""
 FIRST = tl.constexpr(-(2**15))
@@ -136,10 +138,11 @@ def count_kernel(
 @triton.jit(do_not_specialize=["count", "pairs", "width", "height"])
 def list_kernel(
     means2d, conics, opacities, radii, order, ends, tiles, splats, count, pairs, width, height,
-    PAIRS: tl.constexpr, SIDE: tl.constexpr, RADII: tl.constexpr,
+    PAIRS: tl.constexpr, SIDE: tl.constexpr, RADII: tl.constexpr, SPLIT: tl.constexpr,
 ):  # fmt: skip
-    """The tile and the splat of each pair, splats in `order`. Pairs beyond the last, and those that rounding has left
-    without a tile, get a tile below the image."""
+    """The tile and the splat of each pair, splats in `order`; with SPLIT, the upper four of the splat's 32 bits are for
+    the tile's quarters, row by row. Pairs beyond the last, and those that rounding has left without a tile, get a tile
+    below the image."""
     at = tl.program_id(0) * PAIRS + tl.arange(0, PAIRS)
     valid = at < pairs
     real = at < tl.load(ends + (count - 1))
@@ -165,11 +168,41 @@ def list_kernel(
         tile = tl.where(here, row * width + first + left_over, tile)
         left_over = tl.where(here, -1, left_over - tl.where(left_over >= 0, end - first, 0))
         row += 1
+    rows = rows.to(tl.int32)
+    if SPLIT:
+        for quarter in tl.static_range(4):
+            row, column = tile // width * 2 + quarter // 2, tile % width * 2 + quarter % 2
+            first, end = _columns(row, x, y, a, b, c, bound, det, left * 2, right * 2, SIDE // 2)
+            rows |= ((first <= column) & (column < end)).to(tl.int32) << (quarter + 28)
     tl.store(tiles + at, (tile + FIRST).to(tl.int16), mask=valid)
-    tl.store(splats + at, rows.to(tl.int32), mask=valid)
+    tl.store(splats + at, rows, mask=valid)
 
 
-launch_count, launch_list = Launcher(count_kernel), Launcher(list_kernel)
+@triton.jit(do_not_specialize=["width", "height"])
+def split_kernel(begins, splats, places, lists, width, height, BATCH: tl.constexpr, COUNT: tl.constexpr):
+    """With COUNT, the length of the list of each quarter of a tile, one place behind its own in `places`; otherwise the
+    list, from its place on. Width and height of the image in quarters."""
+    tile = tl.program_id(1) * tl.num_programs(0) + tl.program_id(0)
+    quarter = tl.arange(0, 4)[:, None]
+    row, column = tl.program_id(1) * 2 + quarter // 2, tl.program_id(0) * 2 + quarter % 2
+    inside = (row < height) & (column < width)
+    places += row * width + column
+    place = tl.zeros((4, 1), tl.int32) if COUNT else tl.load(places, mask=inside, other=0)
+    end = tl.load(begins + tile + 1)
+    for start in range(tl.load(begins + tile), end, BATCH):
+        at = start + tl.arange(0, BATCH)[None, :]
+        splat = tl.load(splats + at, mask=at < end, other=0)
+        # A quarter's bit moves to 16 bits of its own, so that one sum counts in all quarters.
+        draws = (splat >> 28 & 15).to(tl.int64) * 0x200040008001 & 0x1000100010001
+        if not COUNT:
+            before = tl.cumsum(draws, 1) - draws >> 16 * quarter & 0xFFFF
+            tl.store(lists + (place + before), splat & 0xFFFFFFF, mask=inside & (draws >> 16 * quarter & 1 > 0))
+        place += (tl.sum(draws, axis=1, keep_dims=True) >> 16 * quarter & 0xFFFF).to(tl.int32)
+    if COUNT:
+        tl.store(places + 1, place, mask=inside)
+
+
+launch_count, launch_list, launch_split = Launcher(count_kernel), Launcher(list_kernel), Launcher(split_kernel)
 
 
 MORE = 1.25
@@ -252,6 +285,7 @@ def tile_lists(
     side: int,
     colors: Tensor | None = None,
     room: Room | FixedRoom | None = None,
+    split: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """Lists of one camera's tiles. All tensors are contiguous.
 
@@ -259,15 +293,19 @@ def tile_lists(
         means2d, depths, conics: a `Projection`'s, M >= 1 rows.
         radii: half the sides, in pixels, of the boxes that bound the splats: of squares [M] or of rectangles [M, 2].
         opacities: as composited, compensation included, [M].
-        width, height: image size in tiles; with the row below, at most 2^16 tiles.
+        width, height: image size in tiles; with the row below, at most 2^16 that are not split.
         side: side of a tile in pixels, `TILE_SIZE` or a part of it.
         colors: [M, D]; splats that are not finite, in these or otherwise, are left out. None: no check.
         room: makes room for its number of pairs and is sent the actual one; None: wait for the number.
+        split: list in tiles of twice the side, for which there is room, and split these lists.
 
     Returns:
         Where each tile's splats begin, int32 [1, height + 1, width], the last row for tiles below the image; rows of
-        the splats, tile by tile, int32. Without enough room some pairs are missing.
+        the splats, tile by tile, int32. Without enough room some pairs are missing. Split: what follows the last row
+        is not set, and not for gsplat's kernels, which would read it.
     """
+    if split:
+        size, side, width, height = (width, height), 2 * side, -(-width // 2), -(-height // 2)
     count, device, axes = len(depths), depths.device, 1 if radii.dim() == 1 else 2
     order = torch.sort(depths, stable=True).indices
     counts = torch.empty(count, dtype=torch.int32, device=device)
@@ -282,21 +320,19 @@ def tile_lists(
     else:
         room.send(ends[-1:])
         pairs = room.pairs
-    tiles = torch.empty(pairs, dtype=torch.int16, device=device)
-    rows = torch.empty(pairs, dtype=torch.int32, device=device)
+    tiles, rows = (torch.empty(pairs, dtype=dtype, device=device) for dtype in (torch.int16, torch.int32))
     if pairs > 0:
         launch_list(
             (-(-pairs // PAIRS), 1, 1), *splats, ends, tiles, rows, count, pairs, width, height,
-            PAIRS=PAIRS, SIDE=side, RADII=axes, num_warps=4,
+            PAIRS=PAIRS, SIDE=side, RADII=axes, SPLIT=split, num_warps=4,
         )  # fmt: skip
     tiles, by_tile = torch.sort(tiles, stable=True)
-    numbers = _numbers(width * (height + 1), device)
-    begins = torch.searchsorted(tiles, numbers, out_int32=True)
-    return begins.view(1, height + 1, width), rows.index_select(0, by_tile)
-
-
-@cache  # for good: recorded steps read it
-def _numbers(count: int, device: torch.device) -> Tensor:
-    """Of the first `count` tiles."""
-    with torch.inference_mode(False):  # they outlive a rendering that records nothing
-        return torch.arange(FIRST.value, FIRST.value + count, dtype=torch.int16, device=device)
+    numbers = torch.arange(FIRST.value, FIRST.value + width * (height + 1), dtype=torch.int16, device=device)
+    begins, rows = torch.searchsorted(tiles, numbers, out_int32=True), rows.index_select(0, by_tile)
+    if not split:
+        return begins.view(1, height + 1, width), rows
+    places, lists = rows.new_zeros(size[1] + 1, size[0]), rows.new_empty(4 * pairs)
+    launch_split((width, height, 1), begins, rows, places, lists, *size, BATCH=BATCH, COUNT=True, num_warps=2)
+    places = places.flatten().cumsum(0, dtype=torch.int32).view(1, *places.shape)
+    launch_split((width, height, 1), begins, rows, places, lists, *size, BATCH=BATCH, COUNT=False, num_warps=2)
+    return places, lists

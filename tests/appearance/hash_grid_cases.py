@@ -56,8 +56,7 @@ def assert_near_twin(grid: HashGrid, twin: HashGrid, x: Tensor, interpolate) -> 
 
     sizes = copy.deepcopy(twin)
     sizes.table.data.abs_()
-    size = sizes.in_torch(exact_x.detach())
-    assert_within(found, exact, 10 * size)
+    assert_within(found, exact, 10 * sizes.in_torch(exact_x.detach()))
 
     (size_d_table,) = torch.autograd.grad(twin.in_torch(exact_x), twin.table, upstream.abs().double())
     cells = (exact_x.detach()[:, None] * twin.resolutions[:, None]).floor().long()

@@ -23,8 +23,7 @@ def case(request):
 
 def test_full_rank_is_the_head(case):
     field, visible, centers = case
-    basis = latent_basis(field, torch.rand(40))
-    whole = with_rank(field, basis, 8)
+    whole = with_rank(field, latent_basis(field, torch.rand(40)), 8)
     assert (whole.splats["latents"] - field.splats["latents"]).abs().max() > 0.01, "the basis must have turned"
     assert_same(whole, field, visible, centers)
 

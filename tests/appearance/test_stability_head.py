@@ -196,8 +196,7 @@ def test_the_field_agrees_with_float64(latent, weight, distance, logit, color, s
     with torch.no_grad():
         got = head(splats, rows, center)
         double = {name: value.double() for name, value in splats.items()}
-        exact_head = head.double()
-        exact = exact_head(double, rows, center.double())
+        exact = head.double()(double, rows, center.double())
 
         directions, log_r = view_geometry(double["means"], center.double(), head.config.distance_eps)
         low, high = fourier_bands(directions, 3)

@@ -86,6 +86,14 @@ def test_tiles_list_what_draws_in_them(shape):
     assert assert_lists(*lists, of, *shape, TILE_SIZE) <= 0.1 * len(lists[1])
 
 
+def test_split_lists_are_those_of_tiles_of_their_size(monkeypatch):
+    """Split in batches that end inside of a tile's list, and with room to spare."""
+    monkeypatch.setattr("nrfgs_ns.rasterizer.tile_lists.BATCH", 16)
+    of, shape, room = splats(200, 100, 70), (13, 9, 8), FixedRoom(2000, torch.device("cpu"))
+    for mine, twin in zip(tile_lists(*of, *shape, room=room, split=True), tile_lists(*of, *shape), strict=True):
+        assert mine.dtype == twin.dtype and torch.equal(mine.flatten()[: twin.numel()], twin.flatten())
+
+
 def test_the_most_tiles():
     """A splat in the last tile of row 249, of 256 with the row below the image."""
     one = torch.ones(1)
@@ -140,15 +148,12 @@ def check(case):
     assert_agrees(judge(case, grads), evaluate(rasterization, case, grads, "cpu"))
 
 
-@pytest.mark.parametrize("name", ["opaque_layers", "larger_than_image", "needles", "opacities_0_to_1", "capped"])
+@pytest.mark.parametrize(
+    "name", ["opaque_layers", "larger_than_image", "needles", "opacities_0_to_1", "capped", "antialiased"]
+)
 def test_hard_cases(ours, name):
     """Together more splats in a tile than a batch, light that runs out, alphas at both cut-offs and at the cap."""
     check(for_our_kernels(CASES[name]()))
-
-
-def test_tiles_of_several_blocks(ours, monkeypatch):
-    monkeypatch.setattr(gsplat_cuda, "SMALL_TILE", 16)
-    check(for_our_kernels(CASES["antialiased"]()))
 
 
 @settings(max_examples=12, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -72,8 +72,8 @@ class Theirs(Exception):
     """gsplat's kernels would have composited."""
 
 
-def draw_with_our_kernels(monkeypatch: pytest.MonkeyPatch, device: str, side: int = 8) -> None:
-    """Composite what the CPU has projected by our kernels on a device, in tiles of a side, and never by gsplat's."""
+def draw_with_our_kernels(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
+    """Composite what the CPU has projected by our kernels on a device, and never by gsplat's."""
     from nrfgs_ns.rasterizer import gsplat_cuda
 
     usual = torch_cpu.composite
@@ -94,7 +94,6 @@ def draw_with_our_kernels(monkeypatch: pytest.MonkeyPatch, device: str, side: in
             projection.means2d.register_hook(leave)
         return render.cpu(), alphas.cpu(), lists
 
-    monkeypatch.setattr(gsplat_cuda, "SMALL_TILE", side)
     monkeypatch.setattr(gsplat_cuda, "_gsplats_image", Mock(side_effect=Theirs))
     for name in ("_kernels_run_on", "_compositing_runs_on"):
         monkeypatch.setattr(gsplat_cuda, name, lambda _: True)

@@ -116,8 +116,7 @@ def _covered(centre: Tensor, radius: Tensor, n_pixels: int) -> Tensor:
     """Whether each pixel of an axis lies in a tile that [centre - radius, centre + radius] meets. [N, n_pixels]"""
     tile = torch.arange(n_pixels) // TILE_SIZE
     first = ((centre - radius) / TILE_SIZE).floor()[:, None]
-    end = ((centre + radius) / TILE_SIZE).ceil()[:, None]
-    return (tile >= first) & (tile < end)
+    return (tile >= first) & (tile < ((centre + radius) / TILE_SIZE).ceil()[:, None])
 
 
 def composite(

@@ -166,15 +166,14 @@ def test_gpu_back_end_agrees_with_the_twin(name, kernels, monkeypatch):
 # Our compositing alone; in Triton's interpreter: kernels/small_interpreted.py.
 @pytest.mark.gpu
 class TestOurKernels:
-    @pytest.mark.parametrize("side", [8, 16])
-    def test_a_crowd(self, monkeypatch, side):
+    def test_a_crowd(self, monkeypatch):
         """Around 130 splats in each tile: several batches, which hand light on."""
-        draw_with_our_kernels(monkeypatch, "cuda", side)
+        draw_with_our_kernels(monkeypatch, "cuda")
         case = _cloud(31, n=300, width=100, height=70, scales=lambda s: 4 * s, opacities=lambda o: 0.2 * o)
         check(for_our_kernels(case))
 
     @settings(max_examples=60, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
-    @given(case=scenes().map(for_our_kernels), side=st.sampled_from([8, 16]))
-    def test_random_scenes(self, monkeypatch, case, side):
-        draw_with_our_kernels(monkeypatch, "cuda", side)
+    @given(case=scenes().map(for_our_kernels))
+    def test_random_scenes(self, monkeypatch, case):
+        draw_with_our_kernels(monkeypatch, "cuda")
         check(case)

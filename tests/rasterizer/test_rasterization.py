@@ -18,8 +18,7 @@ from nrfgs_ns.rasterizer.torch_cpu.tiles import SUB_TILE, footprints, list_tiles
 
 
 def test_info_has_gsplats_keys():
-    case = CASES["ordinary"]()
-    _, _, info = rasterization(*case.arguments())
+    _, _, info = rasterization(*CASES["ordinary"]().arguments())
     assert set(info) == {
         *("camera_ids", "gaussian_ids", "radii", "means2d", "depths", "conics", "opacities"),
         *("tile_width", "tile_height", "width", "height", "tile_size", "n_cameras"),
@@ -236,6 +235,18 @@ class TestOnCuda:
         of = splats(3000, 300, 200)
         lists = tile_lists(*(table.cuda() for table in of), *shape)
         assert_lists(*(part.cpu() for part in lists), of, *shape, TILE_SIZE)
+        if shape[2] < TILE_SIZE:
+            begins, rows = tile_lists(*(table.cuda() for table in of), *shape, split=True)
+            assert torch.equal(begins, lists[0]) and torch.equal(rows[: len(lists[1])], lists[1])
+
+    def test_more_small_tiles_than_numbers(self):
+        """A splat in the last of 400 rows of 512 tiles."""
+        from nrfgs_ns.rasterizer.tile_lists import tile_lists
+
+        one = torch.ones(1).cuda()
+        last = torch.tensor([[4092.0, 3196.0]]).cuda(), one.int(), one, torch.tensor([[1.0, 0.0, 1.0]]).cuda(), one
+        begins, rows = tile_lists(*last, 512, 400, 8, split=True)
+        assert begins.flatten().tolist() == [0] * 512 * 400 + [1] * 512 and rows[0] == 0
 
     @pytest.mark.parametrize("mode", ["RGB", "RGB+ED"])
     @pytest.mark.parametrize("rasterize_mode", ["classic", "antialiased"])

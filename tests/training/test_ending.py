@@ -162,8 +162,7 @@ def test_a_full_disk_is_survived_until_the_end(tiny_scene, tmp_path, monkeypatch
     monkeypatch.setattr(checkpoint_files, "write", full)
     with pytest.raises(DiskFull):
         trainer.train()
-    said = capsys.readouterr().out
-    assert said.count("is full. The training goes on.") == 2  # steps 6 and 9
+    assert capsys.readouterr().out.count("is full. The training goes on.") == 2  # steps 6 and 9
     assert list(find(trainer.checkpoint_dir)) == [3]
 
 

@@ -128,8 +128,7 @@ def test_a_capture_that_needs_none_pays_nothing(tiny_scene, tmp_path, monkeypatc
     checkpoint = checkpoint_of(config)
     assert not any("photograph" in name for name in checkpoint["pipeline"])
     assert "photograph" not in checkpoint["optimizers"]
-    on = {"--pipeline.model.photographs": "on"}
-    more = {"--load-dir": models_of(config), **on}
+    more = {"--load-dir": models_of(config), "--pipeline.model.photographs": "on"}
     with pytest.raises(InputError, match="pipeline.model.photographs off"):
         trained(command_line("nrfgs-sh", tiny_scene, tmp_path / "on", 2, QUICK, more))
     monkeypatch.setenv("NRFGS_LOOK", "view_001.png")

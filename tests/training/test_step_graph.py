@@ -244,8 +244,6 @@ def test_each_photograph_has_its_mask(build):
 @pytest.mark.gpu
 def test_a_graph_outlives_others(build):
     """They are recorded in turn on PyTorch's 32 streams and thrown away, and free memory is given back."""
-    from nrfgs_ns.rasterizer import tile_lists
-
     pipeline, graphs = build("cuda", "nrfgs", "--pipeline.model.photographs", "on")
     with torch.no_grad():
         pipeline.model.photograph.shots.normal_(0.0, 0.1)
@@ -257,8 +255,6 @@ def test_a_graph_outlives_others(build):
         recorded(pipeline, graphs, 100, 1, mask=torch.ones(height, width, 1, dtype=torch.bool))
         (other,) = (graph for graph in graphs._graphs.values() if graph is not first)
         other.room.pairs = 1
-    for side in range(20):
-        tile_lists._numbers(side, pipeline.model.device)
     torch.cuda.empty_cache()
     assert_same(recorded(pipeline, graphs, 103, 3), eager(pipeline, 103, 3))
     assert first in graphs._graphs.values()
