@@ -29,7 +29,7 @@ from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 from torch.nn import Parameter
 
-from nrfgs_ns.densification.statistics import Maxima, take_maxima
+from nrfgs_ns.densification.statistics import Tables, remember
 from nrfgs_ns.densification.strategy import (
     CHANGE,
     CHANGE_BEFORE,
@@ -143,8 +143,8 @@ class ErrorGuidedDensification(Densification):
                 empty = UNSEEN if name in (CHANGE, CHANGE_BEFORE) else 0.0
                 self.state[name] = torch.full((count,), empty, device=info["radii"].device)
         error, gradients = (self.state[ERROR], info["means2d"].absgrad) if step < self.grow_until else (None, None)
-        maxima = Maxima(self.state[WIDTH], error, self.state.get(CHANGE))
-        take_maxima(maxima, info, gradients, info.get("change"))
+        tables = Tables(self.state[WIDTH], error, self.state.get(CHANGE))
+        remember(tables, info, 1.0, gradients, info.get("change"))
 
     # What a refinement does.
 

@@ -11,7 +11,7 @@ from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import remove, reset_opa
 from torch import Tensor
 
-from nrfgs_ns.densification.statistics import take_statistics
+from nrfgs_ns.densification.statistics import Tables, remember
 from nrfgs_ns.densification.strategy import FIRST, Densification, DensificationConfig
 
 EXTENT_MARGIN = 1.1
@@ -184,7 +184,7 @@ class GradientDensification(Densification):
         for name in ("grad2d", "count", "radii"):
             if name in state and state[name] is None:
                 state[name] = torch.zeros(count, device=gradients.device)
-        take_statistics(state, info, gradients)
+        remember(Tables(state.get("radii"), state["grad2d"], state["count"]), info, 2.0, gradients, sums=True)
 
     def _refine(self, step: int, info: Mapping[str, Any], splats, optimizers) -> None:
         """Grow and prune by gsplat's rules, and begin the statistics anew."""

@@ -120,11 +120,6 @@ class Guard:
         condemned = (~(sizes <= MAX_GRADIENT)).any().float()  # NaN compares as false
         for optimizer in optimizers.optimizers.values():
             optimizer.found_inf = condemned
-        means2d = getattr(self.model, "info", {}).get("means2d")
-        if means2d is not None and means2d.retains_grad:  # densification's statistics take what is finite
-            for gradient in (means2d.grad, getattr(means2d, "absgrad", None)):
-                if gradient is not None:
-                    gradient.nan_to_num_(0.0, 0.0, 0.0)
         if sizes.is_cuda:
             self._send_home(self._verdict)
 
