@@ -19,27 +19,9 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import MAX_AUTO_RESOLUTIO
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
-from nrfgs_ns.data.cameras import (
-    SMALLEST,
-    PlacedOutputs,
-    after,
-    cameras_of,
-    check_applied,
-    check_poses,
-    place,
-    read_lenses,
-)
-from nrfgs_ns.data.checks import (
-    check_exist,
-    check_frames,
-    check_headers,
-    check_options,
-    check_unique,
-    find_colmap,
-    number,
-    shown,
-    warn,
-)
+from nrfgs_ns.data import checks
+from nrfgs_ns.data.cameras import SMALLEST, PlacedOutputs, after, read_cameras
+from nrfgs_ns.data.checks import find_colmap, shown, warn
 from nrfgs_ns.data.pictures import read_size, stored_exif
 from nrfgs_ns.data.points import read_colmap, read_ply
 from nrfgs_ns.data.sight import check_sight, in_reach
@@ -55,7 +37,6 @@ PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".heic", ".dng")
 """Suffixes of a camera's files."""
 MIN_POINTS = 4
 """Fewer points cannot start a training: a splat's first size is its distance to its three nearest neighbours."""
-ORIENTATIONS = ("pca", "up", "vertical", "none")
 FOLDERS = {"file_path": "images", "mask_path": "masks"}
 """A frame's files -> folder of their smaller copies, followed by _ and the factor."""
 COLMAP_TO_FRAMES = torch.tensor([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
@@ -145,23 +126,11 @@ class NrfgsDataParser(DataParser):
     def _scene(self) -> Scene:
         """The whole data set, checked as far as can be done without opening all images."""
         config = self.config
-        check_options(config)
+        checks.check_options(config)
         meta, source = self._read()
-        frames = meta["frames"]
-        lenses = read_lenses(meta, source)
-        check_applied(meta, source)
-        scaled = config.auto_scale_poses and len(frames) > 1
-        poses = check_poses(frames, source, need_spread=scaled)
-        factor = self._factor(frames, source) if self.downscale_factor is None else self.downscale_factor
+        cameras, lenses, transform, scale = read_cameras(meta, source, config)
+        factor = self._factor(meta["frames"], source) if self.downscale_factor is None else self.downscale_factor
         splits = self._splits(meta, source)
-        orientation = meta.get("orientation_override", config.orientation_method)
-        if orientation not in ORIENTATIONS:
-            raise InputError(
-                f"{source}: orientation_override is {shown(repr(orientation))}. Use one of {', '.join(ORIENTATIONS)}, "
-                "or remove it."
-            )
-        placed, transform, scale = place(poses, orientation, config.center_method, scaled, config.scale_factor)
-        cameras = cameras_of(meta, lenses, placed, source)
         rounding = getattr(config, "downscale_rounding_mode", "floor")
         cameras.rescale_output_resolution(scaling_factor=1.0 / factor, scale_rounding_mode=rounding)
         if min(cameras.width.min(), cameras.height.min()) < SMALLEST:
@@ -172,14 +141,13 @@ class NrfgsDataParser(DataParser):
         to_frames = COLMAP_TO_FRAMES if self._colmap.exists() else None
         if "applied_transform" in meta:
             to_frames = torch.tensor(np.array(meta["applied_transform"], dtype=np.float64))
-        scale *= number(meta.get("applied_scale", 1.0))
         return Scene(meta, source, splits, factor, lenses, cameras, transform, to_frames, scale)
 
     def _factor(self, frames: list[dict[str, Any]], source: Path) -> int:
         """The downscale factor; every file is there at it."""
         factor = self.config.downscale_factor
         if factor is None:
-            check_exist([self._file(frame["file_path"]) for frame in frames], source, "images")
+            checks.check_exist([self._file(frame["file_path"]) for frame in frames], source, "images")
             first, factor = frames[0]["file_path"], 1
             size = max(read_size(self._file(first)))
             while size / factor > MAX_AUTO_RESOLUTION and (
@@ -187,7 +155,8 @@ class NrfgsDataParser(DataParser):
             ):
                 factor *= 2
         for key in FOLDERS:
-            check_exist(self._files(frames, key, factor), source, "images" if key == "file_path" else f"files of {key}")
+            what = "images" if key == "file_path" else f"files of {key}"
+            checks.check_exist(self._files(frames, key, factor), source, what)
         return factor
 
     def _splits(self, meta: dict[str, Any], source: Path) -> Rows:
@@ -228,13 +197,13 @@ class NrfgsDataParser(DataParser):
         """Check that images or masks have the size of their cameras, or the full one without smaller copies."""
         what = FOLDERS[key]
         if self._has_copies(key, scene.factor):
-            check_unique(paths, f"{scene.source}: frames")
+            checks.check_unique(paths, f"{scene.source}: frames")
             folder = self._copies(key, scene.factor)
             fix = f"Remove {folder}, or with `colmap` give --downscale-rounding-mode round or ceil."
-            check_headers(paths, torch.cat([cameras.width, cameras.height], dim=1).tolist(), what, fix)
+            checks.check_headers(paths, torch.cat([cameras.width, cameras.height], dim=1).tolist(), what, fix)
         else:
             fix = "Use the images of the poses, or scale w, h, fl_x, fl_y, cx and cy with them; masks are as large."
-            check_headers(paths, scene.lenses[rows, 4:6].astype(int), what, fix)
+            checks.check_headers(paths, scene.lenses[rows, 4:6].astype(int), what, fix)
 
     @cached_property
     def _placed_points(self) -> dict[str, torch.Tensor]:
@@ -264,7 +233,7 @@ class NrfgsDataParser(DataParser):
         """The data set as a transforms.json, checked by `check_frames`, its frames sorted by name for splitting, as
         in nerfstudio; and the file that messages name."""
         meta, source = read_transforms(self.config.data)
-        check_frames(meta["frames"], source)
+        checks.check_frames(meta["frames"], source)
         meta["frames"].sort(key=lambda frame: self._file(frame["file_path"]).parts)
         return meta, source
 

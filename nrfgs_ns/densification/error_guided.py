@@ -30,17 +30,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from nrfgs_ns.densification.statistics import Tables, remember
-from nrfgs_ns.densification.strategy import (
-    CHANGE,
-    CHANGE_BEFORE,
-    FIRST,
-    UNSEEN,
-    Densification,
-    DensificationConfig,
-    OpacitySeen,
-    Optimizers,
-    Splats,
-)
+from nrfgs_ns.densification.strategy import CHANGE, Densification, DensificationConfig, OpacitySeen, Optimizers, Splats
 
 ERROR = "error"
 """Name in `state`: the largest error of each splat in a view of this window, [N]."""
@@ -101,8 +91,6 @@ class ErrorGuidedDensification(Densification):
     def __init__(self, config: ErrorGuided, raised: float):
         super().__init__(config, windows=2)
         self.state |= {ERROR: None, WIDTH: None}
-        if config.budget:
-            self.state[FIRST] = None
         self.raised = raised
         self.reschedule(round)
 
@@ -138,10 +126,7 @@ class ErrorGuidedDensification(Densification):
 
     def _take_statistics(self, step: int, info: Mapping[str, Any], count: int) -> None:
         """Let the window's maxima be at least the step's."""
-        for name in self.state.keys() & {ERROR, WIDTH, CHANGE, CHANGE_BEFORE}:
-            if self.state[name] is None:
-                empty = UNSEEN if name in (CHANGE, CHANGE_BEFORE) else 0.0
-                self.state[name] = torch.full((count,), empty, device=info["radii"].device)
+        self.make_tables((ERROR, WIDTH, CHANGE), count, info["radii"].device)
         error, gradients = (self.state[ERROR], info["means2d"].absgrad) if step < self.grow_until else (None, None)
         tables = Tables(self.state[WIDTH], error, self.state.get(CHANGE))
         remember(tables, info, 1.0, gradients, info.get("change"))
@@ -162,8 +147,7 @@ class ErrorGuidedDensification(Densification):
             grown = draw(weights.index_fill(0, parents, 0.0), wanted)
         split(splats, optimizers, torch.cat([parents, grown]), places)
         source = torch.cat([torch.arange(count, device=dead.device).index_copy(0, places, parents), grown])
-        for name in state.keys() & {ERROR, WIDTH, CHANGE, CHANGE_BEFORE}:
-            state[name] = state[name][source]
+        self.take_rows(source, count)
         stored = torch.sigmoid(splats["opacities"].detach()) - DECAY * (1 - min(step / self.end, 1.0))
         splats["opacities"].data.copy_(torch.logit(stored.clamp(1e-6, 1 - torch.finfo(stored.dtype).eps)))
         if self.verbose:

@@ -12,7 +12,7 @@ from gsplat.strategy.ops import remove, reset_opa
 from torch import Tensor
 
 from nrfgs_ns.densification.statistics import Tables, remember
-from nrfgs_ns.densification.strategy import FIRST, Densification, DensificationConfig
+from nrfgs_ns.densification.strategy import Densification, DensificationConfig
 
 EXTENT_MARGIN = 1.1
 """3DGS's extent of a scene: the largest distance of a training camera from their mean, times this."""
@@ -143,7 +143,7 @@ class GradientDensification(Densification):
         self.measure_by_cameras = scene_unit is None
         self.threshold, self.widest = strategy.grow_grad2d, strategy.grow_scale2d
         if self.budget:
-            self.state |= {THRESHOLD: 0.0, FIRST: None}
+            self.state[THRESHOLD] = 0.0
         self.state |= strategy.initialize_state(scene_scale=scene_unit or 1.0)
 
     def needs_absgrad(self, step: int) -> bool:
@@ -181,9 +181,7 @@ class GradientDensification(Densification):
         """Add a step's screen-space gradients, in an image of [-1, 1], and radii, in shares of the longer side."""
         state, means2d = self.state, info["means2d"]
         gradients = means2d.absgrad if self.strategy.absgrad else means2d.grad
-        for name in ("grad2d", "count", "radii"):
-            if name in state and state[name] is None:
-                state[name] = torch.zeros(count, device=gradients.device)
+        self.make_tables(("grad2d", "count", "radii"), count, gradients.device)
         remember(Tables(state.get("radii"), state["grad2d"], state["count"]), info, 2.0, gradients, sums=True)
 
     def _refine(self, step: int, info: Mapping[str, Any], splats, optimizers) -> None:

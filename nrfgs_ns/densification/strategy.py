@@ -7,7 +7,7 @@ wants of the head or of the loss it says itself. A new one is one file, and its 
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, MutableMapping
+from collections.abc import Callable, Iterable, Mapping, MutableMapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -173,7 +173,7 @@ class Densification(ABC):
         self.budget: int = config.budget
         """Number of splats to grow to; 0: as many as the rules give."""
         seen = (CHANGE, CHANGE_BEFORE)[:windows] if self.opacity_seen == "peak" else ()
-        self.state = {HELD: None, **dict.fromkeys(seen)}
+        self.state = {HELD: None, **dict.fromkeys((FIRST, *seen) if self.budget else seen)}
         self.shown: Shown | None = None
 
     def needs_absgrad(self, step: int) -> bool:
@@ -221,11 +221,21 @@ class Densification(ABC):
     def post_backward(self, step: int, info: Mapping[str, Any], splats: Splats, optimizers: Optimizers) -> None:
         """Change the table after the optimisers' step, given the `info` of `pre_backward` with gradients."""
 
+    def make_tables(self, names: Iterable[str], count: int, device: torch.device) -> None:
+        """Make the named statistics of splats that the state lacks yet."""
+        for name in names:
+            if name in self.state and self.state[name] is None:
+                empty = UNSEEN if name == CHANGE else 0.0
+                self.state[name] = torch.full((count,), empty, device=device)
+
+    def take_rows(self, rows: Tensor, count: int) -> None:
+        """Let these rows of the `count` present ones, in this order, be the statistics' rows."""
+        self.state.update({name: value[rows] for name, value in per_splat(self.state, count).items()})
+
     def take_changes(self, info: Mapping[str, Any], count: int) -> None:
         """Let the window's changes of opacity be at least those of a step."""
         if self.opacity_seen == "peak":
-            if self.state[CHANGE] is None:
-                self.state[CHANGE] = torch.full((count,), UNSEEN, device=info["change"].device)
+            self.make_tables([CHANGE], count, info["change"].device)
             self.state[CHANGE].scatter_reduce_(0, info["gaussian_ids"], info["change"], "amax")
 
     def fitting(self, step: int, info: Mapping[str, Any], splats: Splats, optimizers: Optimizers, wanted: int) -> int:

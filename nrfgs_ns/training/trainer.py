@@ -147,7 +147,7 @@ class NrfgsTrainer(Trainer):
         if "schedulers" in content and config.load_scheduler:
             self.optimizers.load_schedulers(content["schedulers"])
         self._follow(training.get("pace"))
-        if self.mean is not None and training.get("parameter_mean") is not None:
+        if self.mean is not None and self.mean.is_saved and training.get("parameter_mean") is not None:
             self.mean.load_state(training["parameter_mean"], self.optimizers.optimizers)
         budget = config.time_budget
         total = f"{self.total_steps:,}" if budget is None else f"as many as fit into {budget:g} minutes"
@@ -242,10 +242,11 @@ class NrfgsTrainer(Trainer):
         with self._last_good_state_on_disk():
             self.guard.begin(step, optimizers, settled_later=self.graphs is not None)
             optimizers.zero_grad_all()
-            _, losses, metrics = self.pipeline.get_train_loss_dict(step, self.graphs)
+            is_logged = step % self.config.logging.steps_per_log == 0
+            _, losses, metrics = self.pipeline.get_train_loss_dict(step, self.graphs, is_logged)
             loss = reduce(torch.add, losses.values())
             if loss.requires_grad:  # a recorded step has made its gradients already
-                loss.backward()
+                loss.backward(torch.full_like(loss, 1.0 / self.world_size))  # the mean of the devices' losses
             self.guard.before_optimizers(optimizers)
             optimizers.step()
             optimizers.scheduler_step_all(step)
@@ -403,7 +404,7 @@ class NrfgsTrainer(Trainer):
         training: dict[str, Any] = {"scene": self._scene(), "options": options_of(self.config)}
         if self.pace is not None:
             training["pace"] = self.pace.state()
-        if self.mean is not None and self.mean.count > 0:
+        if self.mean is not None and self.mean.is_saved and self.mean.count > 0:
             training["parameter_mean"] = self.mean.state()
         return {
             "step": step,

@@ -84,7 +84,7 @@ def step_together(trainer) -> dict:
     pipeline, model = trainer.pipeline, trainer.pipeline.model
     model.step_cb(trainer.optimizers, 0)
     outputs, losses, _ = pipeline.get_train_loss_dict(0)
-    sum(losses.values()).backward()
+    (sum(losses.values()) / comm.world()).backward()
     shared = [value.grad for name, value in pipeline.named_parameters() if "gauss_params" not in name]
     comm.sum_over_devices([gradient for gradient in shared if gradient is not None])
     return {
