@@ -61,13 +61,6 @@ def change_of(stored: Tensor, shown: Tensor) -> Tensor:
     return torch.where(added < 0, added / stored, added)
 
 
-def changes_shown(logits: Tensor, rows: Tensor, shown: Tensor) -> Tensor:
-    """`change_of` the rows [M] of a table with stored logits [N, 1] that a view shows at opacities [M]."""
-    # Rows first, then the sigmoid, as heads do: in the other order the last bit may differ.
-    stored = torch.sigmoid(logits.detach().index_select(0, rows)).squeeze(-1)
-    return change_of(stored, shown.detach().to(stored.dtype))
-
-
 def seen_with(stored: Tensor, change: Tensor) -> Tensor:
     """The opacities that views with these changes show, in [0, 1]; the stored ones where the change is `UNSEEN`."""
     change = torch.where(change > UNSEEN, change, 0.0)
@@ -214,7 +207,9 @@ class Densification(ABC):
         """
         self.shown = Shown(info["gaussian_ids"], opacities, info.get("n_cameras", 1))
         if self.opacity_seen == "peak":
-            changes = changes_shown(logits, info["gaussian_ids"], opacities)
+            # Rows first, then the sigmoid, as heads do: in the other order the last bit may differ.
+            stored = torch.sigmoid(logits.detach().index_select(0, info["gaussian_ids"])).squeeze(-1)
+            changes = change_of(stored, opacities.detach().to(stored.dtype))
             info["change"] = torch.where(info["radii"] > 0, changes, UNSEEN)
 
     @abstractmethod

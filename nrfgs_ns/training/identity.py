@@ -41,12 +41,12 @@ def options_of(config: Any) -> dict[str, str]:
     }
 
 
-def scene_of(names: list[str], cameras: Cameras) -> dict[str, Any]:
+def data_set_of(names: list[str], cameras: Cameras) -> dict[str, Any]:
     """The names of a data set's images, and its camera centres, [V, 3]."""
     return {"images": names, "centers": cameras.camera_to_worlds[:, :3, 3].detach().cpu().clone()}
 
 
-def check_scene(written: Mapping[str, Any], here: Mapping[str, Any], data: object) -> None:
+def check_data_set(written: Mapping[str, Any], here: Mapping[str, Any], data: object) -> None:
     """Raise InputError where a checkpoint was trained on another data set."""
     fix = "Go on with the data set that it was trained on, or train anew."
     if sorted(written["images"]) != sorted(here["images"]):

@@ -73,7 +73,7 @@ def photograph_model(config: Any, datamanager: Any) -> PhotographModel | None:
 
 def check_same_photographs(own: PhotographModel | None, written: Mapping[str, Any] | None) -> None:
     """Raise InputError where a checkpoint, with the entry `written`, learnt photographs and this training does not, or
-    the other way round. That the photographs are the same is checked before (`identity.check_scene`)."""
+    the other way round. That the photographs are the same is checked before (`identity.check_data_set`)."""
     if (own is None) != (written is None):
         theirs, ours = ("on", "off") if own is None else ("off", "on")
         raise InputError(
