@@ -88,6 +88,8 @@ class ErrorGuided(DensificationConfig):
 class ErrorGuidedDensification(Densification):
     """Splits by error, replacement by opacity, decay of opacity."""
 
+    gradients = "absolute"
+
     def __init__(self, config: ErrorGuided, raised: float):
         super().__init__(config, windows=2)
         self.state |= {ERROR: None, WIDTH: None}
@@ -99,18 +101,10 @@ class ErrorGuidedDensification(Densification):
         self.start, self.grow_until = step_at(config.warmup_length), step_at(config.grow_until)
         self.stop, self.end = step_at(config.stop_at), step_at(LAYOUT)
 
-    def needs_absgrad(self, step: int) -> bool:
-        return step < self.grow_until
-
     def rests_at(self, step: int) -> bool:
         return step >= self.grow_until
 
     # What a step shows.
-
-    def pre_backward(self, step: int, info: dict[str, Any], opacities: Tensor, logits: Tensor) -> None:
-        super().pre_backward(step, info, opacities, logits)
-        if step < self.grow_until:
-            info["means2d"].retain_grad()
 
     @torch.no_grad()
     def post_backward(self, step, info, splats, optimizers) -> None:

@@ -139,15 +139,13 @@ class GradientDensification(Densification):
     def __init__(self, config: GradientConfig, strategy: PruneBySeenOpacity, scene_unit: float | None):
         super().__init__(config)
         self.strategy, strategy.seen_opacity = strategy, self.seen_opacity
+        self.gradients = "absolute" if strategy.absgrad else "signed"
         self.bounds = {name: getattr(strategy, name) for name in STRATEGY_BOUNDS}
         self.measure_by_cameras = scene_unit is None
         self.threshold, self.widest = strategy.grow_grad2d, strategy.grow_scale2d
         if self.budget:
             self.state[THRESHOLD] = 0.0
         self.state |= strategy.initialize_state(scene_scale=scene_unit or 1.0)
-
-    def needs_absgrad(self, step: int) -> bool:
-        return self.strategy.absgrad and step < self.strategy.refine_stop_iter
 
     def rests_at(self, step: int) -> bool:
         return step >= self.strategy.refine_stop_iter
@@ -157,11 +155,6 @@ class GradientDensification(Densification):
         if self.measure_by_cameras:
             spread = (centers - centers.mean(dim=0)).norm(dim=-1).max().item()
             self.state["scene_scale"] = EXTENT_MARGIN * spread or 1.0  # one camera has no extent
-
-    def pre_backward(self, step: int, info: dict[str, Any], opacities: Tensor, logits: Tensor) -> None:
-        super().pre_backward(step, info, opacities, logits)
-        if step < self.strategy.refine_stop_iter:
-            info["means2d"].retain_grad()
 
     def post_backward(self, step, info, splats, optimizers) -> None:
         strategy, self.shown = self.strategy, None
@@ -188,7 +181,7 @@ class GradientDensification(Densification):
         """Grow and prune by gsplat's rules, and begin the statistics anew."""
         strategy, state = self.strategy, self.state
         count, gradients = len(splats["means"]), state["grad2d"] / state["count"].clamp_min(1)
-        threshold = self._threshold_for_budget(step, count) if self.budget else self.threshold
+        threshold = self._threshold_for_budget(step, gradients) if self.budget else self.threshold
         strategy.grow_grad2d, strategy.grow_scale2d = threshold, self.widest
         growing = gradients > threshold
         if step < strategy.refine_scale2d_stop_iter:
@@ -210,19 +203,18 @@ class GradientDensification(Densification):
                 state[name].zero_()
         torch.cuda.empty_cache()
 
-    def _threshold_for_budget(self, step: int, count: int) -> float:
-        """The gradient above which splats grow now, for as many as the budget by the end of growth.
+    def _threshold_for_budget(self, step: int, gradients: Tensor) -> float:
+        """The gradient above which splats grow now, of those of all, for as many as the budget by the end of growth.
 
         Where the number is off its `course`, the logarithm of the threshold moves, by at most `LARGEST_STEP`. No more
         splats grow by their gradient than bring the number to its course; wide ones may be split besides.
         """
-        state = self.state
+        state, count = self.state, len(gradients)
         goal = self.course(step, count, self.strategy.refine_start_iter, self.strategy.refine_stop_iter)
         if abs(count - goal) > DEAD_BAND * goal:
             move = math.log(count / goal)
             state[THRESHOLD] += max(-LARGEST_STEP, min(move, LARGEST_STEP))
         threshold, room = self.threshold * math.exp(state[THRESHOLD]), max(round(goal) - count, 0)
-        gradients = state["grad2d"] / state["count"].clamp_min(1)
         if room < count:  # the threshold is exclusive
             threshold = max(threshold, gradients.kthvalue(count - room).values.item())
         return threshold

@@ -160,6 +160,8 @@ class Densification(ABC):
     """Whether refinements are printed."""
     pixels: int = 0
     """Of the largest photograph."""
+    gradients: Literal["none", "signed", "absolute"] = "none"
+    """By the splats' places on the screen, needed until it rests; absolute: summed over pixels as such (AbsGS)."""
 
     def __init__(self, config: DensificationConfig, windows: int = 1):
         self.config, self.name, self.opacity_seen = config, config.name, config.opacity_seen
@@ -171,7 +173,7 @@ class Densification(ABC):
 
     def needs_absgrad(self, step: int) -> bool:
         """Whether the rasterizer must leave sum |dL/dmean2d| in `info["means2d"].absgrad` in this step."""
-        return False
+        return self.gradients == "absolute" and not self.rests_at(step)
 
     moved_at: int | None = None
     """Last step at which rows of the table came to denote other splats although no tensor was replaced."""
@@ -206,6 +208,8 @@ class Densification(ABC):
             logits: the stored opacities of all splats, as logits [N, 1].
         """
         self.shown = Shown(info["gaussian_ids"], opacities, info.get("n_cameras", 1))
+        if self.gradients != "none" and not self.rests_at(step):
+            info["means2d"].retain_grad()
         if self.opacity_seen == "peak":
             # Rows first, then the sigmoid, as heads do: in the other order the last bit may differ.
             stored = torch.sigmoid(logits.detach().index_select(0, info["gaussian_ids"])).squeeze(-1)
