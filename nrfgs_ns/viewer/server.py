@@ -76,12 +76,12 @@ def protect() -> None:
 
 
 def wrap(name: str, around: Callable[..., None]) -> None:
-    """Let a method of nerfstudio's `Viewer` be `around`, which gets the viewer, the method itself and its arguments."""
+    """Let a method of nerfstudio's `Viewer` be `around`, which gets the method itself before its arguments."""
     method = getattr(Viewer, name)
-    setattr(Viewer, name, functools.partialmethod(around, method))
+    setattr(Viewer, name, functools.wraps(method)(lambda *args, **options: around(method, *args, **options)))
 
 
-def _open_guarded(viewer: Viewer, open_viewer: Callable[..., None], config, *args, **options) -> None:
+def _open_guarded(open_viewer: Callable[..., None], viewer: Viewer, config, *args, **options) -> None:
     """Open a viewer on the chosen host, with a line on how to look from elsewhere."""
     if type(config) is ViewerConfig and config.websocket_host == ALL_INTERFACES:  # nobody chose it
         config = replace(config, websocket_host=LOCAL)
@@ -103,7 +103,7 @@ def _open_guarded(viewer: Viewer, open_viewer: Callable[..., None], config, *arg
         viewer.viewer_info.append(f"Whoever reaches {config.websocket_host} can look, and steer the training.")
 
 
-def _update_without_exceptions(viewer: Viewer, update_scene: Callable[..., None], step: int, *args, **options) -> None:
+def _update_without_exceptions(update_scene: Callable[..., None], viewer: Viewer, step: int, *args, **options) -> None:
     """Update the scene, as a training does after each step: a browser that leaves, or whose camera is odd, must not end
     it. Also show the step of a training that is over."""
     with contextlib.suppress(Exception):
@@ -112,7 +112,7 @@ def _update_without_exceptions(viewer: Viewer, update_scene: Callable[..., None]
         update_scene(viewer, step, *args, **options)
 
 
-def _complete_without_pause(viewer: Viewer, training_complete: Callable[..., None]) -> None:
+def _complete_without_pause(training_complete: Callable[..., None], viewer: Viewer) -> None:
     """Say that the training is complete, which leaves a button that pauses nothing."""
     training_complete(viewer)
     _hide_pause(viewer)

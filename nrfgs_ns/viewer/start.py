@@ -67,7 +67,7 @@ class SmallPhotographs:
         return {"image": small.float() / 255 if small.dtype == torch.uint8 else small}
 
 
-def _init_with_small_photographs(viewer: Viewer, init_scene: Callable[..., None], train_dataset, *args, **options):
+def _init_with_small_photographs(init_scene: Callable[..., None], viewer: Viewer, train_dataset, *args, **options):
     """Open the scene with small photographs."""
     read = vars(viewer.pipeline.datamanager).get("cached_train")
     with few_threads():
