@@ -47,8 +47,8 @@ def remember(
     change: Tensor | None = None,
     sums: bool = False,
 ) -> None:
-    """Take a step into the tables, which are written to. Norms that are not finite count as 0, and changes
-    that are NaN not at all.
+    """Take a step into the tables, which are written to. Norms that are not finite count as 0, changes that are NaN not
+    at all.
 
     Args:
         info: the rasterizer's; M rows, those of radius 0 of splats that are not visible.
