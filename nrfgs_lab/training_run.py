@@ -14,7 +14,7 @@ from typing import Any
 import torch
 import tyro
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import profiler
@@ -49,6 +49,14 @@ def parse(args: list[str]) -> TrainerConfig:
     return config
 
 
+def set_up(config: TrainerConfig, rank: int = 0, world: int = 1) -> Trainer:
+    """A trainer before its first step, with the seed that ns-train sets; `rank` of a `world` of devices."""
+    _set_random_seed(config.machine.seed)
+    trainer = config.setup(local_rank=rank, world_size=world)
+    trainer.setup()
+    return trainer
+
+
 def train(
     args: list[str],
     on_step: Callable[[int], None] | None = None,
@@ -64,9 +72,7 @@ def train(
     """
     config = parse(args)
     config.save_config()
-    _set_random_seed(config.machine.seed)
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
+    trainer = set_up(config)
     model, path = trainer.pipeline.model, str(config.get_base_dir() / "config.yml")
     record = TrainRecord(args, path)
     if earlier is not None:

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
+from plyfile import PlyData, PlyElement
 
 from nrfgs_ns.data.pictures import read_exif, read_picture
-from nrfgs_ns.data.points import write_ply
 from nrfgs_ns.data.views import interior_test_images
 from nrfgs_ns.files import write_whole
 from nrfgs_prepare.pairs import Advance
@@ -51,6 +51,12 @@ def write_scene(undistorted: Path, photos: Path, out: Path, advance: Advance) ->
     rgb = np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
     write_ply(out / "sparse.ply", xyz, rgb)
     write_whole(out / "transforms.json", json.dumps(_transforms(model, images, taken), indent=1) + "\n")
+
+
+def write_ply(path: Path, xyz: np.ndarray, rgb: np.ndarray) -> None:
+    """Write a .ply of points [N, 3], stored as float32, with colours uint8 [N, 3]."""
+    columns = np.rec.fromarrays([*xyz.astype("<f4").T, *rgb.astype("u1").T], names="x,y,z,red,green,blue")
+    PlyData([PlyElement.describe(np.asarray(columns), "vertex")], byte_order="<").write(str(path))
 
 
 def _transforms(model: Any, images: list[Any], taken: dict[str, dict[str, float | str]]) -> dict[str, Any]:

@@ -28,11 +28,10 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
-from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import writer
 from torch import Tensor
 
-from nrfgs_lab.training_run import parse
+from nrfgs_lab.training_run import parse, set_up
 from nrfgs_ns.data.cameras import place
 from nrfgs_ns.data.datamanager import NrfgsDatamanager, NrfgsDatamanagerConfig, NrfgsInputDataset
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
@@ -96,9 +95,7 @@ class Nrfgs:
         config.output_dir = Path(self.folder.name)
         if self.checkpoint is not None:
             config.load_checkpoint = self.file
-        _set_random_seed(config.machine.seed)
-        trainer = config.setup(local_rank=0, world_size=1)
-        trainer.setup()
+        trainer = set_up(config)
         trainer.guard.step = trainer._start_step
         trainer.guard.check_parameters(trainer.optimizers)
         if trainer.pace is not None:

@@ -98,7 +98,7 @@ def _sees(scene: Scene, camera: Array, points: Array) -> Array:
 
 
 def _write_files(scene: Scene, folder: Path, advance: Callable[[], object]) -> None:
-    from nrfgs_ns.data.points import write_ply  # imports nerfstudio: seconds, for work alone
+    from nrfgs_prepare.scene import write_ply  # for work alone
 
     config = scene.config
     cameras = dome_cameras(config)

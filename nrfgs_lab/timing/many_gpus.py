@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import torch
 import torch.distributed as dist
 import torch.multiprocessing as mp
 import tyro
@@ -23,7 +22,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from nrfgs_lab.bench.spec import QUIET
 from nrfgs_lab.many_processes import join_group
 from nrfgs_lab.timing.scale import WARM, Stopwatch
-from nrfgs_lab.training_run import machine, parse, synchronize
+from nrfgs_lab.training_run import machine, parse, set_up, synchronize
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.model import initial_splats
 
@@ -77,11 +76,9 @@ def one_device(rank: int, load: Load, world: int, folder: str) -> None:
     }
     words = [str(word) for option in options.items() for word in option]
     config = parse(["nrfgs", *QUIET, *words, *shlex.split(load.options)])
-    torch.manual_seed(config.machine.seed)
     # The spacing of a grid: the search for the neighbours of millions takes longer than the measurement.
     initial_splats.mean_distance = lambda means: means.new_full((len(means), 1), EXTENT / load.splats ** (1 / 3))
-    trainer = config.setup(local_rank=rank, world_size=world)
-    trainer.setup()
+    trainer = set_up(config, rank, world)
 
     def before(step: int) -> None:
         if world > 1 and step in (WARM, watch.end):

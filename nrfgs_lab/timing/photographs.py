@@ -27,8 +27,8 @@ from PIL import Image
 
 from nrfgs_lab.bench.spec import QUIET
 from nrfgs_lab.training_run import machine, parse
-from nrfgs_ns.data.points import write_ply
 from nrfgs_ns.files import write_whole
+from nrfgs_prepare.scene import write_ply
 
 CAPTURES = {
     "30 of 12 megapixels": (30, 4000, 3000, ""),

@@ -40,7 +40,7 @@ from nrfgs_lab.bench.measure import at_size, frames_per_second
 from nrfgs_lab.bench.run import host_without_downloads
 from nrfgs_lab.bench.spec import QUIET
 from nrfgs_lab.bench.table import grid
-from nrfgs_lab.training_run import machine, parse, synchronize
+from nrfgs_lab.training_run import machine, parse, set_up, synchronize
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.image.ssim import photometric_loss
@@ -177,8 +177,7 @@ def trainer_of(method: str, scene: Path, device: str, watch: Stopwatch, splats: 
     options = {"--machine.device-type": device, "--max-num-iterations": watch.steps, "--output-dir": scene / "out"}
     options |= {f"--pipeline.model.{name}": value for name, value in own.items()}
     words = [str(word) for option in options.items() for word in option]
-    trainer = parse([method, *QUIET, *words, *PARSER.split(), "--data", str(scene)]).setup(local_rank=0, world_size=1)
-    trainer.setup()
+    trainer = set_up(parse([method, *QUIET, *words, *PARSER.split(), "--data", str(scene)]))
     trainer.save_checkpoint = lambda step: None
     trainer.graphs = None if variant else getattr(trainer, "graphs", None)
     trainer.callbacks.insert(0, TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], watch.before))

@@ -43,6 +43,7 @@ LEAST_FOCAL, MOST_FOCAL = 0.02, 10.0
 ROTATION_TOLERANCE = 1e-2
 """Largest entry of |R^T R - 1| of a rotation: rounding to three decimals leaves 3e-3, a scale of 1 % gives 2e-2."""
 LAST_ROW_TOLERANCE = 1e-6
+ORIENTATIONS = ("pca", "up", "vertical", "none")
 POSITION_TOLERANCE = 1e-8
 """Relative difference of camera positions that count as one place; in UTM coordinates it is 5 cm."""
 FAR_OUTSIDE = 100.0
@@ -50,6 +51,28 @@ FAR_OUTSIDE = 100.0
 FAR = 100.0
 """Distance of the cameras' mean from the origin, in their extents, above which they are moved in float64. Nearer ones
 lose less than a hundredth of a pixel, and stay to the bit where nerfstudio puts them."""
+
+
+def read_cameras(meta: dict[str, Any], source: Path, config: Any) -> tuple[Cameras, np.ndarray, Tensor, float]:
+    """The cameras of a transforms.json in full size, oriented, centred and scaled as a parser's options say.
+
+    Returns:
+        The cameras [V]; their intrinsics by `read_lenses`; the transform [3, 4] from the frames' world to the cameras',
+        before scaling; and the scale, also of what was applied before.
+    """
+    frames, lenses = meta["frames"], read_lenses(meta, source)
+    check_applied(meta, source)
+    scaled = config.auto_scale_poses and len(frames) > 1
+    poses = check_poses(frames, source, need_spread=scaled)
+    orientation = meta.get("orientation_override", config.orientation_method)
+    if orientation not in ORIENTATIONS:
+        raise InputError(
+            f"{source}: orientation_override is {shown(repr(orientation))}. Use one of {', '.join(ORIENTATIONS)}, or "
+            "remove it."
+        )
+    placed, transform, scale = place(poses, orientation, config.center_method, scaled, config.scale_factor)
+    cameras = cameras_of(meta, lenses, placed, source)
+    return cameras, lenses, transform, scale * number(meta.get("applied_scale", 1.0))
 
 
 def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -> np.ndarray:

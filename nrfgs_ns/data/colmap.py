@@ -37,7 +37,7 @@ QUATERNION_TOLERANCE = 1e-2
 EXPORT = "Export the COLMAP model again."
 
 
-class View(NamedTuple):
+class Photograph(NamedTuple):
     """One photograph of a model."""
 
     id: int
@@ -47,18 +47,18 @@ class View(NamedTuple):
     """float64 [4, 4], y down, z forwards"""
 
 
-def read_model(folder: Path) -> tuple[dict[int, dict[str, Any]], list[View], Path]:
+def read_model(folder: Path) -> tuple[dict[int, dict[str, Any]], list[Photograph], Path]:
     """Cameras by id (camera_model, w, h and parameters, named as in transforms.json), photographs in the order of their
     ids, and the file of the photographs; InputError also where a camera model cannot be undistorted."""
     path = _file(folder, "cameras")
     stored = _read(read_cameras_text if path.suffix == ".txt" else read_cameras_binary, path)
     cameras = {id: _lens(camera, path) for id, camera in stored.items()}
     path = path.with_stem("images")
-    views = _read(_images_text, path) if path.suffix == ".txt" else _read(_entries, path, _image)
-    views.sort(key=lambda view: view.id)
-    if not views or any(view.camera not in cameras for view in views):
+    photographs = _read(_images_text, path) if path.suffix == ".txt" else _read(_entries, path, _image)
+    photographs.sort(key=lambda photograph: photograph.id)
+    if not photographs or any(photograph.camera not in cameras for photograph in photographs):
         raise InputError(f"{path} holds no photograph, or one whose camera is missing. {EXPORT}")
-    return cameras, views, path
+    return cameras, photographs, path
 
 
 def read_points(folder: Path) -> tuple[np.ndarray, np.ndarray, Path]:
@@ -104,25 +104,25 @@ def _lens(camera: Any, path: Path) -> dict[str, Any]:
     return {"camera_model": kind, "w": camera.width, "h": camera.height, **lens}
 
 
-def _view(id: int, pose: Sequence[float], camera: int, name: str) -> View:
+def _photograph(id: int, pose: Sequence[float], camera: int, name: str) -> Photograph:
     """A photograph with a pose of a unit quaternion and a position."""
     quaternion, position = np.split(np.array(pose, dtype=np.float64).reshape(7), [4])
     if not (abs(np.linalg.norm(quaternion) - 1) <= QUATERNION_TOLERANCE and np.isfinite(position).all()):
         raise ValueError(f"the pose of {name} holds NaN or Inf, or a quaternion that is not of length 1")
     world_to_camera = np.eye(4)
     world_to_camera[:3, :3], world_to_camera[:3, 3] = qvec2rotmat(quaternion), position
-    return View(id, name, camera, world_to_camera)
+    return Photograph(id, name, camera, world_to_camera)
 
 
-def _images_text(path: Path) -> list[View]:
-    views = []
+def _images_text(path: Path) -> list[Photograph]:
+    photographs = []
     lines = iter(path.read_text(encoding="utf-8").splitlines())
     for line in lines:
         if line.strip() and not line.lstrip().startswith("#"):
             id, *pose, camera, name = line.split(maxsplit=9)
-            views.append(_view(int(id), pose, int(camera), name.strip()))
+            photographs.append(_photograph(int(id), pose, int(camera), name.strip()))
             next(lines, None)  # features
-    return views
+    return photographs
 
 
 def _entries(path: Path, read: Callable[[BinaryIO], Any]) -> list[Any]:
@@ -134,11 +134,11 @@ def _entries(path: Path, read: Callable[[BinaryIO], Any]) -> list[Any]:
     return entries
 
 
-def _image(file: BinaryIO) -> View:
+def _image(file: BinaryIO) -> Photograph:
     id, *pose, camera = _take(file, "<i7di")
     name = b"".join(iter(lambda: _take(file, "c")[0], b"\0")).decode("utf-8")
     file.seek(24 * _take(file, "<Q")[0], 1)  # features
-    return _view(id, pose, camera, name)
+    return _photograph(id, pose, camera, name)
 
 
 def _point(file: BinaryIO) -> tuple:

@@ -34,20 +34,20 @@ class NrfgsColmapDataParser(NrfgsDataParser):
         config = self.config
         if not os.path.exists(config.data):
             raise InputError(f"{shown(str(config.data))}: no such folder. Check the path that --data names.")
-        cameras, views, source = read_model(self._colmap)
-        kinds = {cameras[view.camera]["camera_model"] for view in views}
+        cameras, photographs, source = read_model(self._colmap)
+        kinds = {cameras[photograph.camera]["camera_model"] for photograph in photographs}
         if len(kinds) > 1:
             raise InputError(f"{source}: some cameras are fisheyes and some are not. Undistort the photographs.")
         upright = UPRIGHT if config.assume_colmap_world_coordinate_convention else np.eye(4)
         flip = np.array([1.0, -1.0, -1.0, 1.0])  # y up, z backwards
         frames = [
             {
-                "file_path": view.name,
-                **cameras[view.camera],
-                "transform_matrix": upright @ np.linalg.inv(view.world_to_camera) * flip,
-                **({} if config.masks_path is None else {"mask_path": view.name}),
+                "file_path": photograph.name,
+                **cameras[photograph.camera],
+                "transform_matrix": upright @ np.linalg.inv(photograph.world_to_camera) * flip,
+                **({} if config.masks_path is None else {"mask_path": photograph.name}),
             }
-            for view in views
+            for photograph in photographs
         ]
         check_frames(frames, source)
         return {"frames": frames, "camera_model": kinds.pop(), "applied_transform": upright[:3].tolist()}, source

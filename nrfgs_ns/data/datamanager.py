@@ -270,32 +270,26 @@ def undistorted(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
 
 
 def from_files(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
-    """The same from files, which are made if they are missing; InputError if there is no room for them."""
-    folder = _folder(dataset, index, image_type)
-    mapped = ("image",) if dataset._dataparser_outputs.mask_filenames is None else ("image", "mask")
+    """The same from a mapped file, which writing to the tensors does not change, and which is made if it is missing;
+    InputError if there is no room for it."""
+    path = _file(dataset, index, image_type)
     try:
-        pixels, lens = _read(folder, mapped)
-    except (OSError, ValueError, EOFError):  # missing, or cut, as cleaners of caches leave them
-        data = undistorted(dataset, index, image_type)
-        lens = np.array([getattr(dataset.cameras, name)[index].item() for name in LENS])
+        kept = torch.load(path, mmap=True, weights_only=True)
+    except Exception:  # missing, or cut, as cleaners of caches leave them
+        made = undistorted(dataset, index, image_type)
+        kept = {name: made[name].contiguous() for name in ("image", "mask") if name in made}
+        kept["lens"] = [getattr(dataset.cameras, name)[index].item() for name in LENS]
         try:
-            for name, values in {**{name: data[name].numpy() for name in mapped}, "lens": lens}.items():
-                with whole(folder / f"{name}.npy") as aside, aside.open("wb") as file:
-                    np.save(file, values)
-        except OSError as error:
+            with whole(path) as aside:
+                torch.save(kept, aside)
+        except (OSError, RuntimeError) as error:  # torch raises RuntimeError where the disk is full
             raise InputError(
-                f"{folder} cannot be written ({error.strerror}). Make room there, set XDG_CACHE_HOME to another "
-                "folder, or give more --pipeline.datamanager.image-memory."
+                f"{path} cannot be written ({error}). Make room there, set XDG_CACHE_HOME to another folder, or give "
+                "more --pipeline.datamanager.image-memory."
             ) from error
-        pixels, lens = _read(folder, mapped)
-    _set_lens(dataset.cameras, index, lens.tolist())
-    return {"image_idx": index, **pixels}
-
-
-def _read(folder: Path, mapped: Sequence[str]) -> tuple[dict[str, Tensor], np.ndarray]:
-    """Pixels of mapped files, which writing to the tensors does not change, and `LENS`."""
-    pixels = {name: torch.from_numpy(np.load(folder / f"{name}.npy", mmap_mode="c")) for name in mapped}
-    return pixels, np.load(folder / "lens.npy")
+        kept = torch.load(path, mmap=True, weights_only=True)
+    _set_lens(dataset.cameras, index, kept.pop("lens"))
+    return {"image_idx": index, **kept}
 
 
 def look_through(image: Tensor) -> None:
@@ -303,8 +297,8 @@ def look_through(image: Tensor) -> None:
     image.view(torch.uint8).flatten()[::PAGE].sum()
 
 
-def _folder(dataset: Any, index: int, image_type: str) -> Path:
-    """Folder of a photograph's files, named by a digest of all that decides its pixels."""
+def _file(dataset: Any, index: int, image_type: str) -> Path:
+    """A photograph's file, named by a digest of all that decides its pixels."""
     outputs, cameras = dataset._dataparser_outputs, dataset.cameras
     paths = [names[index] for names in (outputs.image_filenames, outputs.mask_filenames) if names is not None]
     files = [(str(path.resolve()), (stat := path.stat()).st_size, stat.st_mtime_ns) for path in paths]
@@ -312,7 +306,7 @@ def _folder(dataset: Any, index: int, image_type: str) -> Path:
     camera = [distortion, *(getattr(cameras, name)[index].item() for name in (*LENS, "camera_type"))]
     kept = [files, camera, image_type, dataset.scale_factor, str(outputs.alpha_color)]
     name = hashlib.sha256(json.dumps(kept).encode("utf-8", "surrogateescape")).hexdigest()[:24]
-    return cache_folder() / name
+    return cache_folder() / f"{name}.pt"
 
 
 def _set_lens(cameras: Cameras, index: int, lens: Sequence[float]) -> None:

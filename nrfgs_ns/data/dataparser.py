@@ -19,27 +19,9 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import MAX_AUTO_RESOLUTIO
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
-from nrfgs_ns.data.cameras import (
-    SMALLEST,
-    PlacedOutputs,
-    after,
-    cameras_of,
-    check_applied,
-    check_poses,
-    place,
-    read_lenses,
-)
-from nrfgs_ns.data.checks import (
-    check_exist,
-    check_frames,
-    check_headers,
-    check_options,
-    check_unique,
-    find_colmap,
-    number,
-    shown,
-    warn,
-)
+from nrfgs_ns.data import checks
+from nrfgs_ns.data.cameras import SMALLEST, PlacedOutputs, after, read_cameras
+from nrfgs_ns.data.checks import find_colmap, shown, warn
 from nrfgs_ns.data.pictures import read_size, stored_exif
 from nrfgs_ns.data.points import read_colmap, read_ply
 from nrfgs_ns.data.sight import check_sight, in_reach
@@ -55,7 +37,6 @@ PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".heic", ".dng")
 """Suffixes of a camera's files."""
 MIN_POINTS = 4
 """Fewer points cannot start a training: a splat's first size is its distance to its three nearest neighbours."""
-ORIENTATIONS = ("pca", "up", "vertical", "none")
 FOLDERS = {"file_path": "images", "mask_path": "masks"}
 """A frame's files -> folder of their smaller copies, followed by _ and the factor."""
 COLMAP_TO_FRAMES = torch.tensor([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
@@ -75,7 +56,7 @@ class NrfgsDataParserConfig(NerfstudioDataParserConfig):
     """start from the points of the data set (ply_file_path, otherwise colmap/sparse/0)"""
 
 
-class Scene(NamedTuple):
+class DataSet(NamedTuple):
     """A whole data set, before it is split."""
 
     meta: dict[str, Any]
@@ -110,31 +91,31 @@ class NrfgsDataParser(DataParser):
 
     def _generate_dataparser_outputs(self, split: str = "train", **_: Any) -> DataparserOutputs:
         """Parse one split; the first call checks the whole data set."""
-        scene = self._scene
-        chosen = next((name for name in STAND_INS.get(split, ()) if len(scene.splits[name])), split)
+        data_set = self._data_set
+        chosen = next((name for name in STAND_INS.get(split, ()) if len(data_set.splits[name])), split)
         if chosen == "train" != split:
-            warn(f"{scene.source}: no image is kept for {split}. The training images are evaluated instead.")
-        rows = scene.splits[chosen]
-        frames = [scene.meta["frames"][row] for row in rows]
-        images, masks = (self._files(frames, key, scene.factor) for key in FOLDERS)
-        cameras = scene.cameras[torch.from_numpy(rows)]
+            warn(f"{data_set.source}: no image is kept for {split}. The training images are evaluated instead.")
+        rows = data_set.splits[chosen]
+        frames = [data_set.meta["frames"][row] for row in rows]
+        images, masks = (self._files(frames, key, data_set.factor) for key in FOLDERS)
+        cameras = data_set.cameras[torch.from_numpy(rows)]
         if self.downscale_factor is None:
-            self._check_sizes(scene, rows, "file_path", images, cameras)
+            self._check_sizes(data_set, rows, "file_path", images, cameras)
             if masks:
-                self._check_sizes(scene, rows, "mask_path", masks, cameras)
-        copies = all(self._has_copies(key, scene.factor) for key in FOLDERS if key in frames[0])
+                self._check_sizes(data_set, rows, "mask_path", masks, cameras)
+        copies = all(self._has_copies(key, data_set.factor) for key in FOLDERS if key in frames[0])
         corner = torch.full((3,), self.config.scene_scale)
         outputs = PlacedOutputs(
             image_filenames=images,
             cameras=cameras,
             scene_box=SceneBox(aabb=torch.stack([-corner, corner])),
             mask_filenames=masks or None,
-            dataparser_scale=scene.scale,
-            dataparser_transform=after(scene.transform, scene.to_frames),
+            dataparser_scale=data_set.scale,
+            dataparser_transform=after(data_set.transform, data_set.to_frames),
             metadata={
-                "exif": [stored_exif(frame, scene.source) for frame in frames],
-                "factor": scene.factor,
-                "downscale": 1 if copies else scene.factor,
+                "exif": [stored_exif(frame, data_set.source) for frame in frames],
+                "factor": data_set.factor,
+                "downscale": 1 if copies else data_set.factor,
             },
         )
         if self.config.load_3D_points and self.downscale_factor is None:
@@ -142,26 +123,14 @@ class NrfgsDataParser(DataParser):
         return outputs
 
     @cached_property
-    def _scene(self) -> Scene:
+    def _data_set(self) -> DataSet:
         """The whole data set, checked as far as can be done without opening all images."""
         config = self.config
-        check_options(config)
+        checks.check_options(config)
         meta, source = self._read()
-        frames = meta["frames"]
-        lenses = read_lenses(meta, source)
-        check_applied(meta, source)
-        scaled = config.auto_scale_poses and len(frames) > 1
-        poses = check_poses(frames, source, need_spread=scaled)
-        factor = self._factor(frames, source) if self.downscale_factor is None else self.downscale_factor
+        cameras, lenses, transform, scale = read_cameras(meta, source, config)
+        factor = self._factor(meta["frames"], source) if self.downscale_factor is None else self.downscale_factor
         splits = self._splits(meta, source)
-        orientation = meta.get("orientation_override", config.orientation_method)
-        if orientation not in ORIENTATIONS:
-            raise InputError(
-                f"{source}: orientation_override is {shown(repr(orientation))}. Use one of {', '.join(ORIENTATIONS)}, "
-                "or remove it."
-            )
-        placed, transform, scale = place(poses, orientation, config.center_method, scaled, config.scale_factor)
-        cameras = cameras_of(meta, lenses, placed, source)
         rounding = getattr(config, "downscale_rounding_mode", "floor")
         cameras.rescale_output_resolution(scaling_factor=1.0 / factor, scale_rounding_mode=rounding)
         if min(cameras.width.min(), cameras.height.min()) < SMALLEST:
@@ -172,14 +141,13 @@ class NrfgsDataParser(DataParser):
         to_frames = COLMAP_TO_FRAMES if self._colmap.exists() else None
         if "applied_transform" in meta:
             to_frames = torch.tensor(np.array(meta["applied_transform"], dtype=np.float64))
-        scale *= number(meta.get("applied_scale", 1.0))
-        return Scene(meta, source, splits, factor, lenses, cameras, transform, to_frames, scale)
+        return DataSet(meta, source, splits, factor, lenses, cameras, transform, to_frames, scale)
 
     def _factor(self, frames: list[dict[str, Any]], source: Path) -> int:
         """The downscale factor; every file is there at it."""
         factor = self.config.downscale_factor
         if factor is None:
-            check_exist([self._file(frame["file_path"]) for frame in frames], source, "images")
+            checks.check_exist([self._file(frame["file_path"]) for frame in frames], source, "images")
             first, factor = frames[0]["file_path"], 1
             size = max(read_size(self._file(first)))
             while size / factor > MAX_AUTO_RESOLUTION and (
@@ -187,7 +155,8 @@ class NrfgsDataParser(DataParser):
             ):
                 factor *= 2
         for key in FOLDERS:
-            check_exist(self._files(frames, key, factor), source, "images" if key == "file_path" else f"files of {key}")
+            what = "images" if key == "file_path" else f"files of {key}"
+            checks.check_exist(self._files(frames, key, factor), source, what)
         return factor
 
     def _splits(self, meta: dict[str, Any], source: Path) -> Rows:
@@ -224,38 +193,38 @@ class NrfgsDataParser(DataParser):
         root = self._root(key)
         return root.with_name(f"{root.name}_{factor}")
 
-    def _check_sizes(self, scene: Scene, rows: np.ndarray, key: str, paths: list[Path], cameras: Cameras) -> None:
+    def _check_sizes(self, data_set: DataSet, rows: np.ndarray, key: str, paths: list[Path], cameras: Cameras) -> None:
         """Check that images or masks have the size of their cameras, or the full one without smaller copies."""
         what = FOLDERS[key]
-        if self._has_copies(key, scene.factor):
-            check_unique(paths, f"{scene.source}: frames")
-            folder = self._copies(key, scene.factor)
+        if self._has_copies(key, data_set.factor):
+            checks.check_unique(paths, f"{data_set.source}: frames")
+            folder = self._copies(key, data_set.factor)
             fix = f"Remove {folder}, or with `colmap` give --downscale-rounding-mode round or ceil."
-            check_headers(paths, torch.cat([cameras.width, cameras.height], dim=1).tolist(), what, fix)
+            checks.check_headers(paths, torch.cat([cameras.width, cameras.height], dim=1).tolist(), what, fix)
         else:
             fix = "Use the images of the poses, or scale w, h, fl_x, fl_y, cx and cy with them; masks are as large."
-            check_headers(paths, scene.lenses[rows, 4:6].astype(int), what, fix)
+            checks.check_headers(paths, data_set.lenses[rows, 4:6].astype(int), what, fix)
 
     @cached_property
     def _placed_points(self) -> dict[str, torch.Tensor]:
         """points3D_xyz float32 [N, 3] and points3D_rgb uint8 [N, 3] in the cameras' world; nothing, with a warning, if
         there are too few."""
-        scene = self._scene
-        points = self._points(scene)
+        data_set = self._data_set
+        points = self._points(data_set)
         count = 0 if points is None else len(points[0])
         if count < MIN_POINTS:
             finding = "the data set has no point cloud (no ply_file_path, no colmap/sparse/0)"
             if points is not None:
                 finding = f"the point cloud holds {count} usable points, fewer than {MIN_POINTS}"
-            warn(f"{scene.source}: {finding}. Training starts from random points, which costs quality.")
+            warn(f"{data_set.source}: {finding}. Training starts from random points, which costs quality.")
             return {}
         xyz, rgb, transform = torch.from_numpy(points[0]), torch.from_numpy(points[1]), points[2].double()
-        xyz = scene.scale * (xyz @ transform[:, :3].T + transform[:, 3])
-        near = torch.from_numpy(in_reach(xyz.numpy(), scene.cameras, scene.source))
+        xyz = data_set.scale * (xyz @ transform[:, :3].T + transform[:, 3])
+        near = torch.from_numpy(in_reach(xyz.numpy(), data_set.cameras, data_set.source))
         xyz, rgb = xyz[near].float(), rgb[near]
-        rows = scene.splits["train"]
-        names = [scene.meta["frames"][row]["file_path"] for row in rows]
-        check_sight(xyz, scene.cameras[torch.from_numpy(rows)], names, scene.source)
+        rows = data_set.splits["train"]
+        names = [data_set.meta["frames"][row]["file_path"] for row in rows]
+        check_sight(xyz, data_set.cameras[torch.from_numpy(rows)], names, data_set.source)
         return {"points3D_xyz": xyz, "points3D_rgb": rgb}
 
     # Different for COLMAP models.
@@ -264,7 +233,7 @@ class NrfgsDataParser(DataParser):
         """The data set as a transforms.json, checked by `check_frames`, its frames sorted by name for splitting, as
         in nerfstudio; and the file that messages name."""
         meta, source = read_transforms(self.config.data)
-        check_frames(meta["frames"], source)
+        checks.check_frames(meta["frames"], source)
         meta["frames"].sort(key=lambda frame: self._file(frame["file_path"]).parts)
         return meta, source
 
@@ -295,13 +264,13 @@ class NrfgsDataParser(DataParser):
         fields = {split: f"{split}_filenames" for split in SPLITS}
         return {split: (name, meta[name]) for split, name in fields.items() if name in meta}
 
-    def _points(self, scene: Scene) -> tuple[np.ndarray, np.ndarray, torch.Tensor] | None:
+    def _points(self, data_set: DataSet) -> tuple[np.ndarray, np.ndarray, torch.Tensor] | None:
         """Positions [N, 3] and colours [N, 3] as stored, and the transform [3, 4] from their world to the cameras'
         before scaling; None without."""
-        if "ply_file_path" in scene.meta:
-            return *read_ply(self._file(str(scene.meta["ply_file_path"]))), scene.transform
+        if "ply_file_path" in data_set.meta:
+            return *read_ply(self._file(str(data_set.meta["ply_file_path"]))), data_set.transform
         if self._colmap.is_dir():
-            return *read_colmap(self._colmap), after(scene.transform, scene.to_frames)
+            return *read_colmap(self._colmap), after(data_set.transform, data_set.to_frames)
         return None
 
 

@@ -56,7 +56,7 @@ class Views(NamedTuple):
     """x right, y down, z forward, [V, 4, 4]"""
 
 
-class Sight(NamedTuple):
+class Visibility(NamedTuple):
     """How V views see P points."""
 
     inside: Tensor
@@ -101,7 +101,7 @@ def small_views(images: Iterable[Tensor], masks: Iterable[Tensor | None], intrin
     return Views(table[:, :3].permute(0, 2, 3, 1), table[:, 3] > 0.99, intrinsics, poses)
 
 
-def sight(views: Views, points: Tensor) -> Sight:
+def visibility(views: Views, points: Tensor) -> Visibility:
     """Which views see which of the capture's own points [P, 3], occlusion aside."""
     rotation, shift = views.world_to_camera[:, :3, :3], views.world_to_camera[:, :3, 3]
     seen = points @ rotation.mT + shift[:, None]
@@ -116,11 +116,11 @@ def sight(views: Views, points: Tensor) -> Sight:
         wider = torch.exp(-(((angle - BEST_ANGLE) / WIDTH) ** 2))
         weight = torch.where(angle < BEST_ANGLE, (angle / BEST_ANGLE) ** 2, wider)
         in_common[one] = (weight * (inside[one] & inside)).sum(-1)
-    return Sight(inside, depth, in_common.fill_diagonal_(-1.0))
+    return Visibility(inside, depth, in_common.fill_diagonal_(-1.0))
 
 
 def sources(in_common: Tensor) -> Tensor:
-    """The views that one view is compared with, by its row of `Sight.in_common`, [at most SOURCES]."""
+    """The views that one view is compared with, by its row of `Visibility.in_common`, [at most SOURCES]."""
     best = in_common.topk(min(SOURCES, len(in_common)))
     return best.indices[best.values > (0.05 * best.values[0]).clamp_min(LEAST_IN_COMMON)]
 
@@ -193,7 +193,7 @@ def dense_points(
         Positions [N, 3] and colours in 0..1 [N, 3].
     """
     grey = (views.rgb @ views.rgb.new_tensor([0.299, 0.587, 0.114]))[:, None]
-    known = sight(views, points[:: max(len(points) // MOST_POINTS, 1)])
+    known = visibility(views, points[:: max(len(points) // MOST_POINTS, 1)])
     compared = [sources(row) for row in known.in_common]
     inverse = grey.new_zeros(len(grey), *grey.shape[2:])
     good = torch.zeros_like(inverse, dtype=torch.bool)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData
 
 from nrfgs_ns.data.checks import shown, warn
 from nrfgs_ns.data.colmap import read_points
@@ -49,12 +49,6 @@ def _columns(vertices: np.ndarray, names: Sequence[str]) -> np.ndarray:
     if table.dtype.kind not in "iuf":  # lists: NumPy before 2.2 takes lists of one for numbers
         raise ValueError(f"{', '.join(names)} are not numbers")
     return table
-
-
-def write_ply(path: Path, xyz: np.ndarray, rgb: np.ndarray) -> None:
-    """Write a .ply of points [N, 3], stored as float32, with colours uint8 [N, 3]."""
-    columns = np.rec.fromarrays([*xyz.astype("<f4").T, *rgb.astype("u1").T], names="x,y,z,red,green,blue")
-    PlyData([PlyElement.describe(np.asarray(columns), "vertex")], byte_order="<").write(str(path))
 
 
 def read_colmap(folder: Path) -> tuple[np.ndarray, np.ndarray]:

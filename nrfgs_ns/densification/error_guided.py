@@ -29,18 +29,8 @@ from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 from torch.nn import Parameter
 
-from nrfgs_ns.densification.statistics import Maxima, take_maxima
-from nrfgs_ns.densification.strategy import (
-    CHANGE,
-    CHANGE_BEFORE,
-    FIRST,
-    UNSEEN,
-    Densification,
-    DensificationConfig,
-    OpacitySeen,
-    Optimizers,
-    Splats,
-)
+from nrfgs_ns.densification.statistics import Tables, remember
+from nrfgs_ns.densification.strategy import CHANGE, Densification, DensificationConfig, OpacitySeen, Optimizers, Splats
 
 ERROR = "error"
 """Name in `state`: the largest error of each splat in a view of this window, [N]."""
@@ -98,11 +88,11 @@ class ErrorGuided(DensificationConfig):
 class ErrorGuidedDensification(Densification):
     """Splits by error, replacement by opacity, decay of opacity."""
 
+    gradients = "absolute"
+
     def __init__(self, config: ErrorGuided, raised: float):
         super().__init__(config, windows=2)
         self.state |= {ERROR: None, WIDTH: None}
-        if config.budget:
-            self.state[FIRST] = None
         self.raised = raised
         self.reschedule(round)
 
@@ -111,18 +101,10 @@ class ErrorGuidedDensification(Densification):
         self.start, self.grow_until = step_at(config.warmup_length), step_at(config.grow_until)
         self.stop, self.end = step_at(config.stop_at), step_at(LAYOUT)
 
-    def needs_absgrad(self, step: int) -> bool:
-        return step < self.grow_until
-
     def rests_at(self, step: int) -> bool:
         return step >= self.grow_until
 
     # What a step shows.
-
-    def pre_backward(self, step: int, info: dict[str, Any], opacities: Tensor, logits: Tensor) -> None:
-        super().pre_backward(step, info, opacities, logits)
-        if step < self.grow_until:
-            info["means2d"].retain_grad()
 
     @torch.no_grad()
     def post_backward(self, step, info, splats, optimizers) -> None:
@@ -138,13 +120,10 @@ class ErrorGuidedDensification(Densification):
 
     def _take_statistics(self, step: int, info: Mapping[str, Any], count: int) -> None:
         """Let the window's maxima be at least the step's."""
-        for name in self.state.keys() & {ERROR, WIDTH, CHANGE, CHANGE_BEFORE}:
-            if self.state[name] is None:
-                empty = UNSEEN if name in (CHANGE, CHANGE_BEFORE) else 0.0
-                self.state[name] = torch.full((count,), empty, device=info["radii"].device)
+        self.make_tables((ERROR, WIDTH, CHANGE), count, info["radii"].device)
         error, gradients = (self.state[ERROR], info["means2d"].absgrad) if step < self.grow_until else (None, None)
-        maxima = Maxima(self.state[WIDTH], error, self.state.get(CHANGE))
-        take_maxima(maxima, info, gradients, info.get("change"))
+        tables = Tables(self.state[WIDTH], error, self.state.get(CHANGE))
+        remember(tables, info, 1.0, gradients, info.get("change"))
 
     # What a refinement does.
 
@@ -162,8 +141,7 @@ class ErrorGuidedDensification(Densification):
             grown = draw(weights.index_fill(0, parents, 0.0), wanted)
         split(splats, optimizers, torch.cat([parents, grown]), places)
         source = torch.cat([torch.arange(count, device=dead.device).index_copy(0, places, parents), grown])
-        for name in state.keys() & {ERROR, WIDTH, CHANGE, CHANGE_BEFORE}:
-            state[name] = state[name][source]
+        self.take_rows(source, count)
         stored = torch.sigmoid(splats["opacities"].detach()) - DECAY * (1 - min(step / self.end, 1.0))
         splats["opacities"].data.copy_(torch.logit(stored.clamp(1e-6, 1 - torch.finfo(stored.dtype).eps)))
         if self.verbose:

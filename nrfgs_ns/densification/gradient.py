@@ -11,8 +11,8 @@ from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import remove, reset_opa
 from torch import Tensor
 
-from nrfgs_ns.densification.statistics import take_statistics
-from nrfgs_ns.densification.strategy import FIRST, Densification, DensificationConfig
+from nrfgs_ns.densification.statistics import Tables, remember
+from nrfgs_ns.densification.strategy import Densification, DensificationConfig
 
 EXTENT_MARGIN = 1.1
 """3DGS's extent of a scene: the largest distance of a training camera from their mean, times this."""
@@ -139,15 +139,13 @@ class GradientDensification(Densification):
     def __init__(self, config: GradientConfig, strategy: PruneBySeenOpacity, scene_unit: float | None):
         super().__init__(config)
         self.strategy, strategy.seen_opacity = strategy, self.seen_opacity
+        self.gradients = "absolute" if strategy.absgrad else "signed"
         self.bounds = {name: getattr(strategy, name) for name in STRATEGY_BOUNDS}
         self.measure_by_cameras = scene_unit is None
         self.threshold, self.widest = strategy.grow_grad2d, strategy.grow_scale2d
         if self.budget:
-            self.state |= {THRESHOLD: 0.0, FIRST: None}
+            self.state[THRESHOLD] = 0.0
         self.state |= strategy.initialize_state(scene_scale=scene_unit or 1.0)
-
-    def needs_absgrad(self, step: int) -> bool:
-        return self.strategy.absgrad and step < self.strategy.refine_stop_iter
 
     def rests_at(self, step: int) -> bool:
         return step >= self.strategy.refine_stop_iter
@@ -157,11 +155,6 @@ class GradientDensification(Densification):
         if self.measure_by_cameras:
             spread = (centers - centers.mean(dim=0)).norm(dim=-1).max().item()
             self.state["scene_scale"] = EXTENT_MARGIN * spread or 1.0  # one camera has no extent
-
-    def pre_backward(self, step: int, info: dict[str, Any], opacities: Tensor, logits: Tensor) -> None:
-        super().pre_backward(step, info, opacities, logits)
-        if step < self.strategy.refine_stop_iter:
-            info["means2d"].retain_grad()
 
     def post_backward(self, step, info, splats, optimizers) -> None:
         strategy, self.shown = self.strategy, None
@@ -181,10 +174,8 @@ class GradientDensification(Densification):
         """Add a step's screen-space gradients, in an image of [-1, 1], and radii, in shares of the longer side."""
         state, means2d = self.state, info["means2d"]
         gradients = means2d.absgrad if self.strategy.absgrad else means2d.grad
-        for name in ("grad2d", "count", "radii"):
-            if name in state and state[name] is None:
-                state[name] = torch.zeros(count, device=gradients.device)
-        take_statistics(state, info, gradients)
+        self.make_tables(("grad2d", "count", "radii"), count, gradients.device)
+        remember(Tables(state.get("radii"), state["grad2d"], state["count"]), info, 2.0, gradients, sums=True)
 
     def _refine(self, step: int, info: Mapping[str, Any], splats, optimizers) -> None:
         """Grow and prune by gsplat's rules, and begin the statistics anew."""

@@ -9,14 +9,7 @@ import torch
 from torch import Tensor
 
 from nrfgs_ns.densification.relocation import add_noise, add_samples, relocate
-from nrfgs_ns.densification.strategy import (
-    CHANGE,
-    Densification,
-    DensificationConfig,
-    OpacitySeen,
-    Optimizers,
-    Splats,
-)
+from nrfgs_ns.densification.strategy import Densification, DensificationConfig, OpacitySeen, Optimizers, Splats
 
 LARGEST_BUDGET = 2**24
 """`torch.multinomial` draws from no more categories than this."""
@@ -66,7 +59,7 @@ class McmcDensification(Densification):
     def __init__(self, config: Mcmc, scene_unit: float):
         super().__init__(config, windows=2)
         self.scene_unit = scene_unit
-        self.start, self.stop = config.warmup_length, config.stop_at
+        self.reschedule(round)
 
     def rests_at(self, step: int) -> bool:
         return step >= self.stop
@@ -93,8 +86,7 @@ class McmcDensification(Densification):
         wanted = max(min(self.budget, int(1.05 * count)) - count, 0)
         wanted = self.fitting(step, info, splats, optimizers, wanted)
         added = add_samples(splats, optimizers, wanted, MIN_OPACITY)
-        if self.state.get(CHANGE) is not None:
-            self.state[CHANGE] = self.state[CHANGE][moved[added]]
+        self.take_rows(moved[added], count)
 
     def reschedule(self, step_at: Callable[[float], int]) -> None:
         self.start, self.stop = step_at(self.config.warmup_length), step_at(self.config.stop_at)

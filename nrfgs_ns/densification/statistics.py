@@ -15,11 +15,22 @@ from torch import Tensor
 from nrfgs_ns.kernels.trial import tried_once
 
 
+class Tables(NamedTuple):
+    """What is remembered of each of N splats, [N] each; None: not wanted."""
+
+    widths: Tensor | None
+    """largest radii, in shares of the image's longer side"""
+    norms: Tensor | None
+    """norms of screen-space gradients, their sum or the largest"""
+    others: Tensor | None
+    """number of steps, or the largest change of opacity"""
+
+
 class Step(NamedTuple):
     """What a step shows of M splats."""
 
     rows: Tensor
-    """of the statistics, int64 [M]"""
+    """of the tables, int64 [M]"""
     radii: Tensor
     """pixels, [M]; 0 where a row is not to count"""
     side: float
@@ -28,95 +39,62 @@ class Step(NamedTuple):
     """what gradients by the rows' centres, in pixels, are multiplied by"""
 
 
-def _step(info: Mapping[str, Any], extent: float) -> Step:
-    """The rasterizer's `info` of a step, with gradients in an image as wide and high as `extent`."""
-    width, height, cameras = info["width"], info["height"], info["n_cameras"]
-    scales = width / extent * cameras, height / extent * cameras
-    return Step(info["gaussian_ids"], info["radii"], float(max(width, height)), scales)
-
-
-def take_statistics(state: Mapping[str, Tensor], info: Mapping[str, Any], gradients: Tensor) -> None:
-    """Add a step's screen-space gradients, in an image of [-1, 1], and radii, in shares of the longer side.
+def remember(
+    tables: Tables,
+    info: Mapping[str, Any],
+    extent: float,
+    gradients: Tensor | None,
+    change: Tensor | None = None,
+    sums: bool = False,
+) -> None:
+    """Take a step into the tables, which are written to. Norms that are not finite count as 0, changes that are NaN not
+    at all.
 
     Args:
-        state: "grad2d" and "count" [N], and "radii" [N] if they are wanted: written to.
         info: the rasterizer's; M rows, those of radius 0 of splats that are not visible.
-        gradients: of the loss by the rows' centres, in pixels, [M, 2].
-    """
-    add = add_in_torch
-    if _kernels_take(info, gradients, *(state[name] for name in ("grad2d", "count", "radii") if name in state)):
-        from nrfgs_ns.densification.statistics_triton import add
-    add(state, _step(info, 2.0), gradients)
-
-
-def add_in_torch(state: Mapping[str, Tensor], step: Step, gradients: Tensor) -> None:
-    """The kernel's twin: the same in PyTorch."""
-    visible = step.radii > 0
-    gradients = gradients.clone()
-    gradients[:, 0] *= step.scales[0]
-    gradients[:, 1] *= step.scales[1]
-    norms = gradients.norm(dim=-1) * visible
-    state["grad2d"].index_add_(0, step.rows, norms)
-    state["count"].index_add_(0, step.rows, visible.to(norms.dtype))
-    if "radii" in state:
-        state["radii"][step.rows] = torch.maximum(state["radii"][step.rows], step.radii / step.side)
-
-
-class Maxima(NamedTuple):
-    """The largest of each of N splats; None: not wanted."""
-
-    widths: Tensor
-    """radii, in shares of the longer side"""
-    errors: Tensor | None
-    """norms of screen-space gradients, in an image of [0, 1]"""
-    changes: Tensor | None
-    """of opacity"""
-
-
-def take_maxima(maxima: Maxima, info: Mapping[str, Any], gradients: Tensor | None, change: Tensor | None) -> None:
-    """Let the maxima, which are written to, be at least a step's. Radii and norms are never below 0.
-
-    Args:
-        info: the rasterizer's, as in `take_statistics`.
+        extent: width and height of the image in which gradients are measured.
         gradients: of the loss by the rows' centres, in pixels, [M, 2].
         change: of the rows' opacities, [M].
+        sums: add up norms and steps, instead of keeping the largest norms and changes.
     """
-    raise_maxima = raise_in_torch
-    if _kernels_take(info, *(value for value in (*maxima, gradients, change) if value is not None)):
-        from nrfgs_ns.densification.statistics_triton import raise_maxima
-    raise_maxima(maxima, _step(info, 1.0), gradients, change)
-
-
-def raise_in_torch(maxima: Maxima, step: Step, gradients: Tensor | None, change: Tensor | None) -> None:
-    """The kernel's twin: the same in PyTorch."""
-    (widths, errors, changes), (rows, radii, side, scales) = maxima, step
-    seen = radii > 0
-    widths.scatter_reduce_(0, rows, radii / side, "amax")
-    if errors is not None:
-        x, y = gradients.unbind(dim=-1)
-        errors.scatter_reduce_(0, rows, torch.hypot(x * scales[0], y * scales[1]) * seen, "amax")
-    if changes is not None:
-        changes.scatter_reduce_(0, rows, change.where(seen, -math.inf), "amax")
-
-
-def _kernels_take(info: Mapping[str, Any], *tensors: Tensor) -> bool:
-    """Whether a kernel does it. Where one camera looks, no row of the state occurs twice."""
-    device = tensors[0].device
-    return (
-        device.type == "cuda"
-        and info["n_cameras"] == 1
+    width, height, cameras = info["width"], info["height"], info["n_cameras"]
+    scales = width / extent * cameras, height / extent * cameras
+    step = Step(info["gaussian_ids"], info["radii"], float(max(width, height)), scales)
+    tensors = [value for value in (*tables, gradients, change) if value is not None]
+    take = in_torch
+    if (
+        tensors[0].is_cuda
+        and cameras == 1  # no row occurs twice
         and all(tensor.dtype == torch.float32 and tensor.is_contiguous() for tensor in tensors)
-        and try_kernel(device)
-    )
+        and try_kernel(tensors[0].device)
+    ):
+        from nrfgs_ns.densification.statistics_triton import take
+    take(tables, step, gradients, change, sums)
+
+
+def in_torch(tables: Tables, step: Step, gradients: Tensor | None, change: Tensor | None, sums: bool) -> None:
+    """The kernel's twin: the same in PyTorch."""
+    (widths, norms, others), (rows, radii, side, scales) = tables, step
+    seen = radii > 0
+    if widths is not None:
+        widths.scatter_reduce_(0, rows, radii / side, "amax")
+    if norms is not None:
+        x, y = gradients.unbind(dim=-1)
+        norm = torch.hypot(x * scales[0], y * scales[1]).nan_to_num(0.0, 0.0) * seen
+        norms.scatter_reduce_(0, rows, norm, "sum" if sums else "amax")
+    if others is not None and sums:
+        others.index_add_(0, rows, seen.to(others.dtype))
+    elif others is not None:
+        others.scatter_reduce_(0, rows, change.where(seen & ~change.isnan(), -math.inf), "amax")
 
 
 @tried_once("What densification remembers")
 def try_kernel(device: torch.device) -> None:
-    """Whether the kernels run on a CUDA device; the first step would compile them."""
-    from nrfgs_ns.densification.statistics_triton import add, raise_maxima
+    """Whether the kernel runs on a CUDA device; the first step would compile it."""
+    from nrfgs_ns.densification.statistics_triton import take
 
     one, two = torch.ones(1, device=device), torch.ones(1, 2, device=device)
     step = Step(torch.zeros(1, dtype=torch.int64, device=device), one.int(), 1.0, (1.0, 1.0))
-    add({name: one.clone() for name in ("grad2d", "count", "radii")}, step, two)
-    for errors, gradients in ((one.clone(), two), (None, None)):  # while splats grow, and after it
-        raise_maxima(Maxima(one, errors, one.clone()), step, gradients, one)
+    take(Tables(one, one.clone(), one.clone()), step, two, None, True)
+    for norms in (one.clone(), None):  # while splats grow, and after it
+        take(Tables(one, norms, one.clone()), step, two, one, False)

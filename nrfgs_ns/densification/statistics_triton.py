@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """`statistics.py` in a Triton kernel, for sums and for maxima."""
 
-from collections.abc import Mapping, Sequence
-
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
-from nrfgs_ns.densification.statistics import Maxima, Step
+from nrfgs_ns.densification.statistics import Step, Tables
 from nrfgs_ns.kernels.launch import Launcher
 
 BLOCK = 256
@@ -33,6 +31,7 @@ def take_kernel(
         x = tl.load(gradients + 2 * at, mask=valid, other=0.0) * scale_x
         y = tl.load(gradients + 2 * at + 1, mask=valid, other=0.0) * scale_y
         norm = tl.sqrt(x * x + y * y)
+        norm = tl.where(norm < float("inf"), norm, 0.0)
         held = tl.load(norms + row, mask=valid, other=0.0)
         if SUMS:
             norm += held
@@ -48,19 +47,8 @@ def take_kernel(
 launch = Launcher(take_kernel)
 
 
-def add(state: Mapping[str, Tensor], step: Step, gradients: Tensor) -> None:
-    """`add_in_torch` of float32 tensors, dense, and rows that are all different."""
-    _take((state.get("radii"), state["grad2d"], state["count"]), step, gradients, None, sums=True)
-
-
-def raise_maxima(maxima: Maxima, step: Step, gradients: Tensor | None, change: Tensor | None) -> None:
-    """`raise_in_torch` of float32 tensors, dense, and rows that are all different."""
-    _take(maxima, step, gradients, change, sums=False)
-
-
-def _take(
-    tables: Sequence[Tensor | None], step: Step, gradients: Tensor | None, change: Tensor | None, sums: bool
-) -> None:
+def take(tables: Tables, step: Step, gradients: Tensor | None, change: Tensor | None, sums: bool) -> None:
+    """`statistics.in_torch` of float32 tensors, dense, and rows that are all different."""
     count, written = len(step.rows), [table for table in tables if table is not None]
     if count > 0:
         arguments = *tables, step.rows, step.radii.contiguous(), gradients, change

@@ -7,7 +7,7 @@ wants of the head or of the loss it says itself. A new one is one file, and its 
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, MutableMapping
+from collections.abc import Callable, Iterable, Mapping, MutableMapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -59,13 +59,6 @@ def change_of(stored: Tensor, shown: Tensor) -> Tensor:
     """
     added = shown - stored
     return torch.where(added < 0, added / stored, added)
-
-
-def changes_shown(logits: Tensor, rows: Tensor, shown: Tensor) -> Tensor:
-    """`change_of` the rows [M] of a table with stored logits [N, 1] that a view shows at opacities [M]."""
-    # Rows first, then the sigmoid, as heads do: in the other order the last bit may differ.
-    stored = torch.sigmoid(logits.detach().index_select(0, rows)).squeeze(-1)
-    return change_of(stored, shown.detach().to(stored.dtype))
 
 
 def seen_with(stored: Tensor, change: Tensor) -> Tensor:
@@ -167,18 +160,20 @@ class Densification(ABC):
     """Whether refinements are printed."""
     pixels: int = 0
     """Of the largest photograph."""
+    gradients: Literal["none", "signed", "absolute"] = "none"
+    """By the splats' places on the screen, needed until it rests; absolute: summed over pixels as such (AbsGS)."""
 
     def __init__(self, config: DensificationConfig, windows: int = 1):
         self.config, self.name, self.opacity_seen = config, config.name, config.opacity_seen
         self.budget: int = config.budget
         """Number of splats to grow to; 0: as many as the rules give."""
         seen = (CHANGE, CHANGE_BEFORE)[:windows] if self.opacity_seen == "peak" else ()
-        self.state = {HELD: None, **dict.fromkeys(seen)}
+        self.state = {HELD: None, **dict.fromkeys((FIRST, *seen) if self.budget else seen)}
         self.shown: Shown | None = None
 
     def needs_absgrad(self, step: int) -> bool:
         """Whether the rasterizer must leave sum |dL/dmean2d| in `info["means2d"].absgrad` in this step."""
-        return False
+        return self.gradients == "absolute" and not self.rests_at(step)
 
     moved_at: int | None = None
     """Last step at which rows of the table came to denote other splats although no tensor was replaced."""
@@ -213,19 +208,33 @@ class Densification(ABC):
             logits: the stored opacities of all splats, as logits [N, 1].
         """
         self.shown = Shown(info["gaussian_ids"], opacities, info.get("n_cameras", 1))
+        if self.gradients != "none" and not self.rests_at(step):
+            info["means2d"].retain_grad()
         if self.opacity_seen == "peak":
-            changes = changes_shown(logits, info["gaussian_ids"], opacities)
+            # Rows first, then the sigmoid, as heads do: in the other order the last bit may differ.
+            stored = torch.sigmoid(logits.detach().index_select(0, info["gaussian_ids"])).squeeze(-1)
+            changes = change_of(stored, opacities.detach().to(stored.dtype))
             info["change"] = torch.where(info["radii"] > 0, changes, UNSEEN)
 
     @abstractmethod
     def post_backward(self, step: int, info: Mapping[str, Any], splats: Splats, optimizers: Optimizers) -> None:
         """Change the table after the optimisers' step, given the `info` of `pre_backward` with gradients."""
 
+    def make_tables(self, names: Iterable[str], count: int, device: torch.device) -> None:
+        """Make the named statistics of splats that the state lacks yet."""
+        for name in names:
+            if name in self.state and self.state[name] is None:
+                empty = UNSEEN if name == CHANGE else 0.0
+                self.state[name] = torch.full((count,), empty, device=device)
+
+    def take_rows(self, rows: Tensor, count: int) -> None:
+        """Let these rows of the `count` present ones, in this order, be the statistics' rows."""
+        self.state.update({name: value[rows] for name, value in per_splat(self.state, count).items()})
+
     def take_changes(self, info: Mapping[str, Any], count: int) -> None:
         """Let the window's changes of opacity be at least those of a step."""
         if self.opacity_seen == "peak":
-            if self.state[CHANGE] is None:
-                self.state[CHANGE] = torch.full((count,), UNSEEN, device=info["change"].device)
+            self.make_tables([CHANGE], count, info["change"].device)
             self.state[CHANGE].scatter_reduce_(0, info["gaussian_ids"], info["change"], "amax")
 
     def fitting(self, step: int, info: Mapping[str, Any], splats: Splats, optimizers: Optimizers, wanted: int) -> int:

@@ -7,8 +7,9 @@ With W devices, a step is the step of one process on the mean of the losses of W
 2. It projects its own splats into all of them, and asks the head about each (camera, visible splat) pair (`model.py`).
 3. What was projected travels to the device whose camera it was for (`exchange.py`), which blends it into an image and
    compares that with the photograph. Gradients travel back the same way, and with them what densification needs.
-4. Each device divides its loss by W. Gradients of a splat then arrive where it lives, complete; gradients of what all
-   devices have (the head's shared weights, camera poses) are partial, and summed (`trainer.py`).
+4. Each device goes backward through its loss divided by W. Gradients of a splat then arrive where it lives, complete;
+   gradients of what all devices have (the head's shared weights, camera poses) are partial, and summed
+   (`trainer.py`).
 
 Densification, pruning, resets and Adam are those of one device, on the shard alone. `shards.py` cuts tables of splats
 up, moves rows when shards drift apart, and puts them together for checkpoints, which are those of one device. Messages

@@ -118,24 +118,18 @@ class ShardedModel(NrfgsModel):
     # Training.
 
     def get_loss_dict(self, outputs, batch, metrics_dict=None) -> dict[str, Tensor]:
-        """This device's losses, whose gradients are divided by W: summed over devices they are the mean loss's.
-
-        Means over splats are means over the shard here, and are weighted by the shard's share of the splats.
-        """
+        """This device's losses. Means over splats are means over the shard here, and are weighted by the shard's share
+        of the splats."""
         losses = super().get_loss_dict(outputs, batch, metrics_dict)
         if not self.training:
             return losses
-        devices = comm.world()
         over_splats = {*self.densification.regularisation(self.gauss_params), *shrinkage(self, self.gauss_params)}
-        share = self.num_points * devices / sum(self.counts)
+        share = self.num_points * comm.world() / sum(self.counts)
         for name in over_splats & losses.keys():
             if self.num_points == 0:
                 del losses[name]
             else:
                 losses[name] = losses[name] * share
-        for loss in losses.values():
-            if loss.requires_grad:
-                loss.register_hook(lambda gradient: gradient / devices)
         return losses
 
     def step_post_backward(self, step: int) -> None:

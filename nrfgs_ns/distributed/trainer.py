@@ -52,12 +52,12 @@ class ShardedPipeline(NrfgsPipeline):
         self.world_size = world_size
         torch.manual_seed(torch.initial_seed() + 1 + comm.rank())
 
-    def get_train_loss_dict(self, step: int, graphs: None = None):
+    def get_train_loss_dict(self, step: int, graphs: None = None, with_metrics: bool = True):
         """One camera for each device; see `NrfgsPipeline.get_train_loss_dict`."""
         cameras, batch = self.datamanager.next_train_views(comm.world(), comm.rank())
         outputs = self.model.get_outputs_everywhere(cameras)
-        metrics = self.model.get_metrics_dict(outputs, batch) if step % self.steps_per_log == 0 else {}
-        return outputs, self.model.get_loss_dict(outputs, batch, metrics), metrics
+        losses = self.model.get_loss_dict(outputs, batch)
+        return outputs, losses, self.model.get_metrics_dict(outputs, batch) if with_metrics else {}
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
@@ -73,15 +73,14 @@ class ShardedPipeline(NrfgsPipeline):
 
 class ShardedMean(ParameterMean):
     """`ParameterMean` of one device's splats and of the shared weights. If one device must restart, all do, so that
-    shared weights stay the same. It is in no checkpoint: a training that goes on averages its own steps."""
+    shared weights stay the same. A training that goes on averages its own steps."""
+
+    is_saved = False
 
     def is_current(self, optimizers: Mapping[str, Optimizer]) -> bool:
         """Whether the rows of all devices still denote the splats that were averaged. The host waits for the answer."""
         here = super().is_current(optimizers)
         return all(comm.gather_counts(int(here), parameters_of(next(iter(optimizers.values())))[0].device))
-
-    def load_state(self, state: Mapping[str, Any], optimizers: Mapping[str, Optimizer]) -> None:
-        """Leave the mean of a checkpoint of one device alone."""
 
 
 class ShardedGuard(Guard):
@@ -207,5 +206,4 @@ class ShardedTrainer(NrfgsTrainer):
         content["pipeline"] = map_model_rows(content["pipeline"], gathered, "_model.")
         for name in model.gauss_params:
             content["optimizers"][name] = map_moments(content["optimizers"][name], gathered)
-        content["training"].pop("parameter_mean", None)
         return content

@@ -176,16 +176,11 @@ def fit_harmonics(model, cameras: Cameras) -> Fit:
     """
     model.head.require_splat_colors()
     splats = {name: value.detach() for name, value in model.gauss_params.items()}
-    plain = PlainSplats(
-        means=splats["means"],
-        quats=splats["quats"] / splats["quats"].norm(dim=-1, keepdim=True),
-        scales=splats["scales"],
-        opacities=splats["opacities"],
-        features_dc=splats["features_dc"],
-        features_rest=splats["features_dc"].new_zeros(len(splats["means"]), BASES - 1, 3),
-    )
+    rest = splats.get("features_rest")
+    splats["quats"] = splats["quats"] / splats["quats"].norm(dim=-1, keepdim=True)
+    splats["features_rest"] = splats["features_dc"].new_zeros(model.num_points, BASES - 1, 3)
+    plain = PlainSplats(*(splats[name] for name in PlainSplats._fields))
     if model.head.is_harmonics:
-        rest = splats["features_rest"]
         plain.features_rest[:, : rest.shape[1]] = rest
         return Fit(plain, exact=True, strength=None, views=0, unseen=0)
 

@@ -9,13 +9,13 @@ outputs, info = composite_view(view, appearance, background)   # the image
 
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import torch
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
+from torch.nn.functional import normalize, pad
 
 from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.data.checks import warn
@@ -48,7 +48,7 @@ class Pinhole(NamedTuple):
         across = (torch.arange(self.width, device=x.device, dtype=x.dtype) + 0.5 - cx) / fx
         down = (torch.arange(self.height, device=x.device, dtype=x.dtype) + 0.5 - cy) / fy
         rays = across[:, None] * x + down[:, None, None] * y + z
-        return torch.nn.functional.normalize(rays, dim=-1)
+        return normalize(rays, dim=-1)
 
 
 def pinhole(camera: Cameras, camera_to_world: Tensor, downscale: int) -> Pinhole:
@@ -124,18 +124,11 @@ class Pinholes:
 
 def world_to_camera(camera_to_world: Tensor) -> Tensor:
     """World-to-camera matrices [C, 4, 4] (OpenCV: y down, z forwards) from nerfstudio's poses [C, 3, 4] (OpenGL)."""
-    flip, last = _constants(camera_to_world.device, camera_to_world.dtype)
-    rotation = (camera_to_world[:, :3, :3] * flip).transpose(1, 2)
-    translation = -rotation @ camera_to_world[:, :3, 3:4]
-    return torch.cat([torch.cat([rotation, translation], dim=2), last.expand(len(camera_to_world), 1, 4)], dim=1)
-
-
-@lru_cache
-def _constants(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """The flip of y and z, and a matrix's last row; made once, since copying them to a GPU waits for it."""
-    with torch.inference_mode(False):  # they outlive a rendering that records nothing
-        flip = torch.tensor([1.0, -1.0, -1.0], device=device, dtype=dtype)
-        return flip, torch.tensor([0.0, 0.0, 0.0, 1.0], device=device, dtype=dtype)
+    right, up_and_back, center = camera_to_world[:, :3].split([1, 2, 1], dim=2)
+    rotation = torch.cat([right, -up_and_back], dim=2).transpose(1, 2)
+    matrices = pad(torch.cat([rotation, -rotation @ center], dim=2), (0, 0, 0, 1))
+    matrices[:, 3, 3] = 1.0
+    return matrices
 
 
 class View(NamedTuple):
@@ -176,10 +169,9 @@ def composite_view(
     background: Tensor,
     *,
     with_depth: bool = True,
-    absgrad: bool = False,
-    assume_finite: bool = False,
     image_of: Callable[[Tensor, Tensor], Tensor] | None = None,
     look: Callable[[Tensor], Tensor] | None = None,
+    **options: bool,
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Composite the visible splats over a background.
 
@@ -188,24 +180,17 @@ def composite_view(
         appearance: their colours and opacities.
         background: a colour [3].
         with_depth: return depth, too.
-        absgrad, assume_finite: as in `rasterizer.composite`.
         image_of: of a head at the pixel (`AppearanceHead`). Features are composited over zero, and their image is drawn
             over the background, as opaque as the splats are. None: colours are the image's.
         look: the photograph's exposure model, applied to the rendered image [H, W, 3]; None: clamp it to [0, 1].
+        options: of `rasterizer.composite`: absgrad, assume_finite.
 
     Returns:
         "rgb" [H, W, 3] in [0, 1], "accumulation" [H, W, 1], "background" [H, W, 3], and "depth" [H, W, 1] if wanted;
         and the rasterizer's `info`, for densification.
     """
-    render, alpha, info = composite(
-        view.projection,
-        appearance.colors,
-        appearance.opacities,
-        backgrounds=background[None] if image_of is None else None,
-        with_depth=with_depth,
-        absgrad=absgrad,
-        assume_finite=assume_finite,
-    )
+    behind = background[None] if image_of is None else None
+    render, alpha, info = composite(view.projection, *appearance, backgrounds=behind, with_depth=with_depth, **options)
     render, alpha = render.squeeze(0), alpha.squeeze(0)  # the gradient of [0] would be a copy among zeros
     rgb = render[..., :-1] if with_depth else render
     if image_of is not None:

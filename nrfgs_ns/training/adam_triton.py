@@ -101,7 +101,7 @@ launch = Launcher(adam_kernel)
 
 
 class AdamTable:
-    """The table on one device, and its copy in host memory. Only what has changed since the last step is written."""
+    """The table on one device, and its copy in host memory, where addresses and sizes are written if they change."""
 
     def __init__(self, device: torch.device):
         on_cuda = device.type == "cuda"
@@ -112,7 +112,6 @@ class AdamTable:
         self.copied = torch.cuda.Event() if on_cuda else None
         self.never = torch.zeros((), device=device)
         self.fixed: list[int] = []
-        self.constants: list[tuple] = []
         self.programs = 0
 
     def step(self, work: list[Group], skip: Tensor | None) -> bool:
@@ -144,9 +143,7 @@ class AdamTable:
         if not aligned or (fixed != self.fixed and not self._write_fixed(work, fixed)):
             return False
         count, base = len(gradients), work[0][1][0]
-        if constants != self.constants:
-            self.numbers[CONSTANTS, :count] = np.array(constants).T
-            self.constants = constants
+        self.numbers[CONSTANTS, :count] = np.array(constants).T
         self.rows[GRADIENT, :count] = (np.array(gradients) - base.data_ptr()) >> 2
         self.device.copy_(self.host, non_blocking=True)
         if self.copied is not None:
@@ -181,5 +178,5 @@ class AdamTable:
         self.rows[END, count:] = np.iinfo(np.int64).max
         self.rows[SIZE, :count] = each[4]
         self.rows[FIXED, :count] = (each[:4] - each[0, 0]) >> 2
-        self.fixed, self.constants, self.programs = fixed, [], int(programs.sum())
+        self.fixed, self.programs = fixed, int(programs.sum())
         return True

@@ -27,7 +27,6 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
-from nrfgs_ns.densification.strategy import per_splat
 from nrfgs_ns.errors import ForTheUser
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
 
@@ -120,11 +119,6 @@ class Guard:
         condemned = (~(sizes <= MAX_GRADIENT)).any().float()  # NaN compares as false
         for optimizer in optimizers.optimizers.values():
             optimizer.found_inf = condemned
-        means2d = getattr(self.model, "info", {}).get("means2d")
-        if means2d is not None and means2d.retains_grad:  # densification's statistics take what is finite
-            for gradient in (means2d.grad, getattr(means2d, "absgrad", None)):
-                if gradient is not None:
-                    gradient.nan_to_num_(0.0, 0.0, 0.0)
         if sizes.is_cuda:
             self._send_home(self._verdict)
 
@@ -227,11 +221,10 @@ def take_rows(model, optimizers: Mapping[str, Optimizer], rows: Tensor) -> None:
         optimizers: by group; those of `gauss_params` among them.
         rows: of the table, int64.
     """
-    count, state = len(model.gauss_params["means"]), model.densification.state
+    model.densification.take_rows(rows, model.num_points)
     _update_param_with_optimizer(
         lambda _, old: Parameter(old.detach()[rows]), lambda _, old: old[rows], model.gauss_params, optimizers
     )
-    state.update({name: value[rows] for name, value in per_splat(state, count).items()})
 
 
 def _within(tensor: Tensor, limit: float) -> Tensor:

@@ -14,18 +14,18 @@ from nrfgs_ns.densification import DensificationConfig
 from nrfgs_ns.errors import InputError
 
 MEANING = (
-    "pipeline.model.appearance",
-    "pipeline.model.camera_optimizer.mode",
-    "pipeline.model.rasterize_mode",
-    "pipeline.datamanager.dataparser",
-    "pipeline.datamanager.camera_res_scale_factor",
+    "pipeline.model.appearance.",
+    "pipeline.model.camera_optimizer.mode.",
+    "pipeline.model.rasterize_mode.",
+    "pipeline.datamanager.dataparser.",
+    "pipeline.datamanager.camera_res_scale_factor.",
 )
-"""Options, or groups of options, that define the numbers."""
+"""Options, or groups of options, that define the numbers; each ends with a dot."""
 NEUTRAL = (
-    "pipeline.model.appearance.implementation",
-    "pipeline.datamanager.dataparser.data",
-    "pipeline.datamanager.dataparser.colmap_path",
-    "pipeline.datamanager.dataparser.images_path",
+    "pipeline.model.appearance.implementation.",
+    "pipeline.datamanager.dataparser.data.",
+    "pipeline.datamanager.dataparser.colmap_path.",
+    "pipeline.datamanager.dataparser.images_path.",
 )
 """Options in those groups that change no number, or whose images and poses are compared instead."""
 FAR = 0.01
@@ -34,23 +34,19 @@ FAR = 0.01
 
 def options_of(config: Any) -> dict[str, str]:
     """The options of a training that define its numbers."""
-
-    def is_among(name: str, groups: tuple[str, ...]) -> bool:
-        return any(name == group or name.startswith(f"{group}.") for group in groups)
-
     return {
         name: value.__name__ if isinstance(value, type) else value if isinstance(value, str) else repr(value)
         for name, value in leaves({"pipeline": config.pipeline})
-        if is_among(name, MEANING) and not is_among(name, NEUTRAL)
+        if f"{name}.".startswith(MEANING) and not f"{name}.".startswith(NEUTRAL)
     }
 
 
-def scene_of(names: list[str], cameras: Cameras) -> dict[str, Any]:
+def data_set_of(names: list[str], cameras: Cameras) -> dict[str, Any]:
     """The names of a data set's images, and its camera centres, [V, 3]."""
     return {"images": names, "centers": cameras.camera_to_worlds[:, :3, 3].detach().cpu().clone()}
 
 
-def check_scene(written: Mapping[str, Any], here: Mapping[str, Any], data: object) -> None:
+def check_data_set(written: Mapping[str, Any], here: Mapping[str, Any], data: object) -> None:
     """Raise InputError where a checkpoint was trained on another data set."""
     fix = "Go on with the data set that it was trained on, or train anew."
     if sorted(written["images"]) != sorted(here["images"]):

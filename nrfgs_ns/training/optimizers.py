@@ -50,10 +50,7 @@ class LeanOptimizers(Optimizers):
     @property
     def all_fused(self) -> bool:
         """Whether every optimiser is a fused Adam, which can skip a step on the device (`found_inf`)."""
-        return all(
-            isinstance(optimizer, Adam) and all(group["fused"] for group in optimizer.param_groups)
-            for optimizer in self.optimizers.values()
-        )
+        return all(map(is_fused, self.optimizers.values()))
 
     def zero_grad_all(self) -> None:
         for optimizer in self.optimizers.values():
@@ -75,8 +72,7 @@ class LeanOptimizers(Optimizers):
         optimizer = self.optimizers[name]
         return (
             type(optimizer) is Adam
-            and len(optimizer.state) > 0
-            and all(group["fused"] for group in optimizer.param_groups)
+            and is_fused(optimizer)
             and self.config[name]["optimizer"].max_norm is None
             and all(optimizer.state.get(p) for p in parameters_of(optimizer) if p.grad is not None)
         )
@@ -161,6 +157,10 @@ def try_kernel(device: torch.device) -> None:
     group = {"lr": 0.1, "betas": (0.9, 0.999), "eps": 1e-15, "weight_decay": 0.0}
     with torch.no_grad():
         AdamTable(device).step([(group, [number], [state])], None)
+
+
+def is_fused(optimizer: Optimizer) -> bool:
+    return isinstance(optimizer, Adam) and all(group["fused"] for group in optimizer.param_groups)
 
 
 def parameters_of(optimizer: Optimizer) -> list[Tensor]:

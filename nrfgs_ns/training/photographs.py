@@ -9,7 +9,7 @@ import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -26,26 +26,18 @@ from nrfgs_ns.model.renderer import world_to_camera
 Exif = dict[str, Any]
 
 
-class Evidence(NamedTuple):
-    """Exposures of V photographs, as known before a training."""
+def they_differ(pairs: Pairs, exif: Tensor, seen: Looks) -> bool:
+    """Whether V photographs differ so much that exposure and white balance are learnt unless an option decides.
 
-    pairs: Pairs
-    centers: Tensor
-    """where they were taken, [V, 3]"""
-    exif: Tensor
-    """exposures from EXIF in stops, NaN where it says nothing, [V]"""
-    seen: Looks
-    """exposures from the pairs alone"""
+    EXIF's exposure counts as far as the photographs' brightness follows it: a change that the light or the camera's own
+    tone curve makes up for does not show.
 
-    @property
-    def calls_for_learning(self) -> bool:
-        """Whether exposure and white balance are learnt unless an option decides.
-
-        EXIF's exposure counts as far as the photographs' brightness follows it: a change that the light or the camera's
-        own tone curve makes up for does not show.
-        """
-        vary = any(size >= enough for size, enough in zip(self.seen.random, ENOUGH_STOPS, strict=True))
-        return vary or varies(self.exif) and slope(self.pairs, self.exif) * spread(self.exif) >= ENOUGH_STOPS[0]
+    Args:
+        exif: exposures from EXIF in stops, NaN where it says nothing, [V].
+        seen: exposures from the pairs alone.
+    """
+    vary = any(size >= enough for size, enough in zip(seen.random, ENOUGH_STOPS, strict=True))
+    return vary or varies(exif) and slope(pairs, exif) * spread(exif) >= ENOUGH_STOPS[0]
 
 
 def photograph_model(config: Any, datamanager: Any) -> PhotographModel | None:
@@ -62,26 +54,26 @@ def photograph_model(config: Any, datamanager: Any) -> PhotographModel | None:
     exif = torch.tensor([exposure(entry) for entry in exif_of(dataset.image_filenames, metadata.get("exif"))])
     pairs = compare_photographs(metadata.get("points3D_xyz"), dataset.cameras, datamanager.cached_train)
     centers = dataset.cameras.camera_to_worlds[:, :3, 3].cpu()
-    known = Evidence(pairs, centers, exif, estimate(pairs, torch.full_like(exif, torch.nan), centers))
-    wanted = choice == "on" or known.calls_for_learning
+    seen = estimate(pairs, torch.full_like(exif, torch.nan), centers)
+    wanted = choice == "on" or they_differ(pairs, exif, seen)
     outcome = f"exposure and white balance {'learnt' if wanted else 'not learnt'}"
     if choice == "on":
         reason = "as requested"
     elif wanted:
         reason = "since the photographs differ in brightness or colour"
     else:
-        reason = f"since {'the photographs agree' if any(known.seen.random) else 'too few common points compare them'}"
+        reason = f"since {'the photographs agree' if any(seen.random) else 'too few common points compare them'}"
     CONSOLE.print(f"Photographs: {outcome}, {reason}.", soft_wrap=True)
     if not wanted:
         return None
-    looks = estimate(pairs, exif, centers) if torch.isfinite(exif).any() else known.seen
+    looks = estimate(pairs, exif, centers) if torch.isfinite(exif).any() else seen
     names = [path.name for path in dataset.image_filenames]
     return PhotographModel(names, looks.stops, looks.held)
 
 
 def check_same_photographs(own: PhotographModel | None, written: Mapping[str, Any] | None) -> None:
     """Raise InputError where a checkpoint, with the entry `written`, learnt photographs and this training does not, or
-    the other way round. That the photographs are the same is checked before (`identity.check_scene`)."""
+    the other way round. That the photographs are the same is checked before (`identity.check_data_set`)."""
     if (own is None) != (written is None):
         theirs, ours = ("on", "off") if own is None else ("off", "on")
         raise InputError(

@@ -12,7 +12,6 @@ from time import perf_counter
 from typing import Any
 
 import torch
-from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import track
@@ -70,8 +69,6 @@ class NrfgsPipeline(VanillaPipeline):
     evaluates to null where a metric is undefined, and resumes exactly from its checkpoints."""
 
     config: NrfgsPipelineConfig
-    steps_per_log: int = 1
-    """steps between two evaluations of the training's metrics"""
 
     def __init__(self, config: NrfgsPipelineConfig, device: str, test_mode: str = "val", **kwargs):
         allow_nerfstudio_checkpoints()
@@ -116,23 +113,16 @@ class NrfgsPipeline(VanillaPipeline):
         # Called before every step: walking through all modules for nothing costs the host time.
         return self if self.training == self.model.training == mode else super().train(mode)
 
-    def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
-        """Nerfstudio's; it also learns from the trainer how often metrics are logged."""
-        if attributes.trainer is not None:
-            self.steps_per_log = attributes.trainer.config.logging.steps_per_log
-        return super().get_training_callbacks(attributes)
-
-    def get_train_loss_dict(self, step: int, graphs: StepGraphs | None = None):
-        """Outputs, losses and metrics of a step; metrics only when they are logged. The losses of a step recorded in
-        `graphs` need no gradient: the parameters have theirs."""
+    def get_train_loss_dict(self, step: int, graphs: StepGraphs | None = None, with_metrics: bool = True):
+        """Outputs, losses and metrics of a step. The losses of a step recorded in `graphs` need no gradient: the
+        parameters have theirs."""
         camera, batch = self.datamanager.next_train(step)
         if graphs is not None and graphs.prepare(camera, batch, step):
             outputs, losses = graphs.run(batch)
         else:
             outputs = self.model.get_outputs(camera)
             losses = self.model.get_loss_dict(outputs, batch)
-        metrics = self.model.get_metrics_dict(outputs, batch) if step % self.steps_per_log == 0 else {}
-        return outputs, losses, metrics
+        return outputs, losses, self.model.get_metrics_dict(outputs, batch) if with_metrics else {}
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False

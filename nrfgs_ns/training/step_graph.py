@@ -282,8 +282,8 @@ class _StepGraph:
         self.info = {name: value.detach() if isinstance(value, Tensor) else value for name, value in info.items()}
         for name in ("grad", "absgrad") if info["means2d"].retains_grad else ():
             gradient = getattr(info["means2d"], name, None)
-            if gradient is not None:  # numbers that are not finite count as zero in densification's statistics
-                setattr(self.info["means2d"], name, gradient.nan_to_num_(0.0, 0.0, 0.0))
+            if gradient is not None:
+                setattr(self.info["means2d"], name, gradient)
 
     def had_room(self) -> bool:
         """Whether the step before had room for all pairs."""

@@ -30,7 +30,7 @@ from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.averaging import ParameterMean, window
 from nrfgs_ns.training.checkpoint_files import DiskFull
 from nrfgs_ns.training.guard import Guard, TrainingStopped
-from nrfgs_ns.training.identity import check_options, check_scene, options_of, scene_of
+from nrfgs_ns.training.identity import check_data_set, check_options, data_set_of, options_of
 from nrfgs_ns.training.optimizers import LeanOptimizers
 from nrfgs_ns.training.pace import Pace, TimedPace
 from nrfgs_ns.training.progress import ProgressLine, end_earlier_logs
@@ -134,7 +134,7 @@ class NrfgsTrainer(Trainer):
             raise InputError(f"{path} is of another method, such as splatfacto. Train anew, without --load-dir.")
         self._start_step = content["step"] + 1
         training = content["training"]
-        check_scene(training["scene"], self._scene(), self.pipeline.datamanager.get_datapath())
+        check_data_set(training["scene"], self._data_set(), self.pipeline.datamanager.get_datapath())
         self.pipeline.load_pipeline(content["pipeline"], content["step"])
         check_options(training["options"], options_of(config))
         if config.time_budget is None and self._start_step >= self.total_steps:
@@ -147,15 +147,15 @@ class NrfgsTrainer(Trainer):
         if "schedulers" in content and config.load_scheduler:
             self.optimizers.load_schedulers(content["schedulers"])
         self._follow(training.get("pace"))
-        if self.mean is not None and training.get("parameter_mean") is not None:
+        if self.mean is not None and self.mean.is_saved and training.get("parameter_mean") is not None:
             self.mean.load_state(training["parameter_mean"], self.optimizers.optimizers)
         budget = config.time_budget
         total = f"{self.total_steps:,}" if budget is None else f"as many as fit into {budget:g} minutes"
         CONSOLE.print(f"Going on from {path}, at step {self._start_step} of {total}.", markup=False, soft_wrap=True)
 
-    def _scene(self) -> dict[str, Any]:
+    def _data_set(self) -> dict[str, Any]:
         data = self.pipeline.datamanager.train_dataset
-        return scene_of([Path(name).name for name in data.image_filenames], data.cameras)
+        return data_set_of([Path(name).name for name in data.image_filenames], data.cameras)
 
     def _follow(self, written: dict[str, Any] | None) -> None:
         """Go on from the checkpoint's position on the schedules; the remaining steps walk through the rest."""
@@ -242,10 +242,11 @@ class NrfgsTrainer(Trainer):
         with self._last_good_state_on_disk():
             self.guard.begin(step, optimizers, settled_later=self.graphs is not None)
             optimizers.zero_grad_all()
-            _, losses, metrics = self.pipeline.get_train_loss_dict(step, self.graphs)
+            is_logged = step % self.config.logging.steps_per_log == 0
+            _, losses, metrics = self.pipeline.get_train_loss_dict(step, self.graphs, is_logged)
             loss = reduce(torch.add, losses.values())
             if loss.requires_grad:  # a recorded step has made its gradients already
-                loss.backward()
+                loss.backward(torch.full_like(loss, 1.0 / self.world_size))  # the mean of the devices' losses
             self.guard.before_optimizers(optimizers)
             optimizers.step()
             optimizers.scheduler_step_all(step)
@@ -400,10 +401,10 @@ class NrfgsTrainer(Trainer):
 
     def _checkpoint(self, step: int) -> dict[str, Any]:
         """A checkpoint's content: nerfstudio's entries, and "training", which this class needs to resume."""
-        training: dict[str, Any] = {"scene": self._scene(), "options": options_of(self.config)}
+        training: dict[str, Any] = {"scene": self._data_set(), "options": options_of(self.config)}
         if self.pace is not None:
             training["pace"] = self.pace.state()
-        if self.mean is not None and self.mean.count > 0:
+        if self.mean is not None and self.mean.is_saved and self.mean.count > 0:
             training["parameter_mean"] = self.mean.state()
         return {
             "step": step,

@@ -12,7 +12,7 @@ import ipaddress
 import re
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from http import HTTPStatus
 from types import SimpleNamespace
@@ -69,62 +69,53 @@ def protect() -> None:
     # The page is built. To ask, viser looks through all processes of the machine, and fails if one of them ends then.
     _client_autobuild.ensure_client_is_built = lambda: None
     _infra.websockets = SimpleNamespace(server=SimpleNamespace(serve=_serve), exceptions=websockets.exceptions)
-    Viewer.__init__ = _guarded(Viewer.__init__)
-    Viewer.update_scene = _harmless(Viewer.update_scene)
-    Viewer.training_complete = _without_pause(Viewer.training_complete)
+    wrap("__init__", _open_guarded)
+    wrap("update_scene", _update_without_exceptions)
+    wrap("training_complete", _complete_without_pause)
     ViewerLegacyState.__init__ = _refused
 
 
-def _guarded(open_viewer):
-    """Nerfstudio's `Viewer.__init__` on the chosen host, with a line on how to look from elsewhere."""
-
-    @functools.wraps(open_viewer)
-    def open_guarded(self, config, *args, **options) -> None:
-        if type(config) is ViewerConfig and config.websocket_host == ALL_INTERFACES:  # nobody chose it
-            config = replace(config, websocket_host=LOCAL)
-        _check_address(config.websocket_host, config.websocket_port)
-        open_viewer(self, config, *args, **options)
-        if self.trainer is None:
-            _hide_pause(self)
-        server, tunnel = self.viser_server, self.viser_server._share_tunnel
-        if tunnel is not None and tunnel.get_url():
-            server._websock_server.names.add(urlsplit(tunnel.get_url()).hostname)
-        port, machine = server.get_port(), socket.gethostname()
-        wanted = config.websocket_port or config.websocket_port_default
-        if port != wanted:
-            self.viewer_info = [line.replace(f":{wanted}", f":{port}") for line in self.viewer_info]
-            self.viewer_info.append(f"Port {wanted} is busy; the viewer is at {port}.")
-        if config.websocket_host in (LOCAL, "localhost"):
-            self.viewer_info.append(f"From another machine: ssh -L {port}:localhost:{port} {machine}")
-        else:
-            self.viewer_info.append(f"Whoever reaches {config.websocket_host} can look, and steer the training.")
-
-    return open_guarded
+def wrap(name: str, around: Callable[..., None]) -> None:
+    """Let a method of nerfstudio's `Viewer` be `around`, which gets the method itself before its arguments."""
+    method = getattr(Viewer, name)
+    setattr(Viewer, name, functools.wraps(method)(lambda *args, **options: around(method, *args, **options)))
 
 
-def _harmless(update_scene):
-    """Nerfstudio's `Viewer.update_scene`, which a training calls after each step, without exceptions: a browser that
-    leaves, or whose camera is odd, must not end the training. It also shows the step of a training that is over."""
+def _open_guarded(open_viewer: Callable[..., None], viewer: Viewer, config, *args, **options) -> None:
+    """Open a viewer on the chosen host, with a line on how to look from elsewhere."""
+    if type(config) is ViewerConfig and config.websocket_host == ALL_INTERFACES:  # nobody chose it
+        config = replace(config, websocket_host=LOCAL)
+    _check_address(config.websocket_host, config.websocket_port)
+    open_viewer(viewer, config, *args, **options)
+    if viewer.trainer is None:
+        _hide_pause(viewer)
+    server, tunnel = viewer.viser_server, viewer.viser_server._share_tunnel
+    if tunnel is not None and tunnel.get_url():
+        server._websock_server.names.add(urlsplit(tunnel.get_url()).hostname)
+    port, machine = server.get_port(), socket.gethostname()
+    wanted = config.websocket_port or config.websocket_port_default
+    if port != wanted:
+        viewer.viewer_info = [line.replace(f":{wanted}", f":{port}") for line in viewer.viewer_info]
+        viewer.viewer_info.append(f"Port {wanted} is busy; the viewer is at {port}.")
+    if config.websocket_host in (LOCAL, "localhost"):
+        viewer.viewer_info.append(f"From another machine: ssh -L {port}:localhost:{port} {machine}")
+    else:
+        viewer.viewer_info.append(f"Whoever reaches {config.websocket_host} can look, and steer the training.")
 
-    @functools.wraps(update_scene)
-    def update(self, step: int, *args, **options) -> None:
-        with contextlib.suppress(Exception):
-            if self.trainer is None:
-                self.update_step(step)
-            update_scene(self, step, *args, **options)
 
-    return update
+def _update_without_exceptions(update_scene: Callable[..., None], viewer: Viewer, step: int, *args, **options) -> None:
+    """Update the scene, as a training does after each step: a browser that leaves, or whose camera is odd, must not end
+    it. Also show the step of a training that is over."""
+    with contextlib.suppress(Exception):
+        if viewer.trainer is None:
+            viewer.update_step(step)
+        update_scene(viewer, step, *args, **options)
 
 
-def _without_pause(training_complete):
-    """Nerfstudio's `Viewer.training_complete`, which leaves a button that pauses nothing."""
-
-    @functools.wraps(training_complete)
-    def complete(self) -> None:
-        training_complete(self)
-        _hide_pause(self)
-
-    return complete
+def _complete_without_pause(training_complete: Callable[..., None], viewer: Viewer) -> None:
+    """Say that the training is complete, which leaves a button that pauses nothing."""
+    training_complete(viewer)
+    _hide_pause(viewer)
 
 
 def _hide_pause(viewer: Viewer) -> None:

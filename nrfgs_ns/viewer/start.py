@@ -5,7 +5,7 @@ high, and whose viser searches its archive of icons for every button."""
 import functools
 import tarfile
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from viser import _gui_api, _gui_handles, _icons
 
 from nrfgs_ns.data.pictures import open_picture
 from nrfgs_ns.threads import few_threads
+from nrfgs_ns.viewer.server import wrap
 
 SIDE = 100
 """Pixels of the shorter side as shown"""
@@ -25,7 +26,7 @@ SIDE = 100
 def open_sooner() -> None:
     if _gui_api.svg_from_icon is not icon:
         _gui_api.svg_from_icon = _gui_handles.svg_from_icon = icon
-        Viewer.init_scene = _with_small_photographs(Viewer.init_scene)
+        wrap("init_scene", _init_with_small_photographs)
 
 
 @functools.cache
@@ -66,13 +67,8 @@ class SmallPhotographs:
         return {"image": small.float() / 255 if small.dtype == torch.uint8 else small}
 
 
-def _with_small_photographs(init_scene):
-    """Nerfstudio's `Viewer.init_scene` with small photographs."""
-
-    @functools.wraps(init_scene)
-    def init_small_scene(self, train_dataset, *args, **options) -> None:
-        read = vars(self.pipeline.datamanager).get("cached_train")
-        with few_threads():
-            init_scene(self, SmallPhotographs(train_dataset, read), *args, **options)
-
-    return init_small_scene
+def _init_with_small_photographs(init_scene: Callable[..., None], viewer: Viewer, train_dataset, *args, **options):
+    """Open the scene with small photographs."""
+    read = vars(viewer.pipeline.datamanager).get("cached_train")
+    with few_threads():
+        init_scene(viewer, SmallPhotographs(train_dataset, read), *args, **options)

@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+import os
 import threading
 
 import numpy as np
@@ -171,23 +172,23 @@ def test_images_in_files_are_those_in_memory(capture, tmp_path, monkeypatch, pri
             camera, batch = in_files.next_train(step)
             torch.testing.assert_close(batch["image"], in_memory.cached_train[camera.metadata["cam_idx"]]["image"])
         in_files.cached_train[0]["image"].zero_()  # in memory, not in the file
-    assert len(list((tmp_path / "cache").rglob("*.npy"))) == 10 * 3, "an image, a mask and a lens, each made once"
+    assert len(list((tmp_path / "cache").rglob("*.pt"))) == 10, "one for each photograph, made once"
 
     picture = Image.open(capture.folder / "images/004.png").convert("RGB")
     Image.eval(picture, lambda value: 255 - value).save(capture.folder / "images/004.png")
     anew, _ = loaded(image_memory=0.0)
-    assert len(list((tmp_path / "cache").rglob("*.npy"))) == 10 * 3 + 3
+    assert len(list((tmp_path / "cache").rglob("*.pt"))) == 10 + 1
     assert not torch.equal(anew.cached_train[3]["image"], in_memory.cached_train[3]["image"])
 
 
-@pytest.mark.parametrize("name, content", [("image.npy", None), ("mask.npy", b""), ("lens.npy", b"{")])
-def test_files_that_are_lost_or_cut_are_made_anew(capture, tmp_path, monkeypatch, name, content):
+@pytest.mark.parametrize("left", [None, 0, 1, 500])
+def test_files_that_are_lost_or_cut_are_made_anew(capture, tmp_path, monkeypatch, left):
     """As those who clean a cache leave them, or a system that stopped."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     capture.add_masks()
     before = [data["image"].clone() for data in manager(capture, image_memory=0.0).cached_train]
-    for path in (tmp_path / "cache").rglob(name):
-        path.unlink() if content is None else path.write_bytes(content)
+    for path in (tmp_path / "cache").rglob("*.pt"):
+        path.unlink() if left is None else os.truncate(path, left)
     torch.testing.assert_close([data["image"] for data in manager(capture, image_memory=0.0).cached_train], before)
 
 

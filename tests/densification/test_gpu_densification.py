@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 from nrfgs_ns.densification import statistics
 from nrfgs_ns.densification.relocation import add_noise, split_evenly
-from nrfgs_ns.densification.statistics import Maxima, Step
+from nrfgs_ns.densification.statistics import Step, Tables
 
 pytestmark = pytest.mark.gpu
 
@@ -55,34 +55,18 @@ def test_diffuse_is_gsplats_noise():
     assert_close(results[0], results[1], rtol=1e-4, atol=1e-6 * results[1].abs().max().item())
 
 
-def one_view() -> dict:
-    """What a camera saw: 3000 of 5000 splats, some of them of no size."""
+@pytest.mark.parametrize("sums", [True, False])
+def test_one_camera_is_the_kernels(monkeypatch, sums):
+    """Of 3000 of 5000 splats, some of them of no size."""
     torch.manual_seed(0)
     rows = torch.randperm(5000, device="cuda")[:3000]
     radii = torch.randint(0, 90, (3000,), dtype=torch.int32, device="cuda")
-    return {"width": 640, "height": 480, "n_cameras": 1, "gaussian_ids": rows, "radii": radii}
-
-
-def test_one_camera_is_the_kernels(monkeypatch):
-    info = one_view()
-    info["radii"] += 1
-    state = {name: torch.zeros(5000, device="cuda") for name in ("grad2d", "count", "radii")}
-    gradients = torch.randn(3000, 2, device="cuda")
-    twin = {name: value.clone() for name, value in state.items()}
-    statistics.add_in_torch(twin, Step(info["gaussian_ids"], info["radii"], 640.0, (320.0, 240.0)), gradients)
-    monkeypatch.setattr(statistics, "add_in_torch", None)
-    statistics.take_statistics(state, info, gradients)
-    for name in state:
-        torch.testing.assert_close(state[name], twin[name], rtol=1e-6, atol=0.0)
-
-
-def test_one_cameras_maxima_are_the_kernels(monkeypatch):
-    info = one_view()
-    maxima = Maxima(*(torch.full((5000,), start, device="cuda") for start in (0.0, 0.0, -2.0)))
-    shown = torch.randn(3000, 2, device="cuda"), torch.rand(3000, device="cuda") - 0.5
-    twin = Maxima(*(value.clone() for value in maxima))
-    statistics.raise_in_torch(twin, Step(info["gaussian_ids"], info["radii"], 640.0, (640.0, 480.0)), *shown)
-    monkeypatch.setattr(statistics, "raise_in_torch", None)
-    statistics.take_maxima(maxima, info, *shown)
-    for value, other in zip(maxima, twin, strict=True):
+    info = {"width": 640, "height": 480, "n_cameras": 1, "gaussian_ids": rows, "radii": radii}
+    tables = Tables(*(torch.full((5000,), start, device="cuda") for start in (0.0, 0.0, -2.0)))
+    shown = torch.randn(3000, 2, device="cuda"), None if sums else torch.rand(3000, device="cuda") - 0.5, sums
+    twin = Tables(*(value.clone() for value in tables))
+    statistics.in_torch(twin, Step(rows, radii, 640.0, (640.0, 480.0)), *shown)
+    monkeypatch.setattr(statistics, "in_torch", None)
+    statistics.remember(tables, info, 1.0, *shown)
+    for value, other in zip(tables, twin, strict=True):
         torch.testing.assert_close(value, other, rtol=1e-6, atol=0.0)

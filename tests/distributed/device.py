@@ -37,16 +37,13 @@ BUSY = {"--pipeline.model.view-noise": 0.5}
 
 def trainer_of(scene: Path, out: Path, world: int, method: str = "nrfgs", **options):
     """A trainer, set up, on `world` devices, of which this process is one."""
-    from nrfgs_lab.training_run import parse
+    from nrfgs_lab.training_run import parse, set_up
 
     chosen = {"--data": scene, "--output-dir": out, **COMMON, **options}
     if method == "nrfgs":
         chosen["--pipeline.model.appearance.output-init"] = "default"
     config = parse([method, *(str(word) for option in chosen.items() for word in option)])
-    torch.manual_seed(config.machine.seed)
-    trainer = config.setup(local_rank=dist.get_rank(), world_size=world)
-    trainer.setup()
-    return trainer
+    return set_up(config, dist.get_rank(), world)
 
 
 def precise(trainer) -> None:
@@ -84,7 +81,7 @@ def step_together(trainer) -> dict:
     pipeline, model = trainer.pipeline, trainer.pipeline.model
     model.step_cb(trainer.optimizers, 0)
     outputs, losses, _ = pipeline.get_train_loss_dict(0)
-    sum(losses.values()).backward()
+    (sum(losses.values()) / comm.world()).backward()
     shared = [value.grad for name, value in pipeline.named_parameters() if "gauss_params" not in name]
     comm.sum_over_devices([gradient for gradient in shared if gradient is not None])
     return {

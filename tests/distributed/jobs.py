@@ -106,8 +106,8 @@ def stops_together(scene: Path, folder: Path) -> None:
     def break_image(trainer) -> None:
         step = trainer.pipeline.get_train_loss_dict
 
-        def broken(step_number: int, graphs):
-            outputs, losses, metrics = step(step_number)
+        def broken(step_number: int, *how):
+            outputs, losses, metrics = step(step_number, *how)
             if step_number == 7 and dist.get_rank() == 1:
                 losses["main_loss"] = losses["main_loss"] * float("nan")
                 trainer.pipeline.model.watched["loss main_loss"] = losses["main_loss"].detach()

@@ -9,9 +9,9 @@ from statistics import stdev
 from typing import Any
 
 import torch
-from nerfstudio.scripts.train import _set_random_seed
 from torch.testing import assert_close
 
+from nrfgs_lab import training_run
 from nrfgs_lab.training_run import parse, train
 from nrfgs_ns.method_config import nrfgs
 from nrfgs_ns.training.checkpoint_files import read_latest
@@ -66,10 +66,7 @@ def set_up(args: list[str]) -> NrfgsTrainer:
     """A trainer before its first step, with its config.yml and the seed that ns-train sets."""
     config = parse(args)
     config.save_config()
-    _set_random_seed(config.machine.seed)
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
-    return trainer
+    return training_run.set_up(config)
 
 
 def untrained(scene: Path, out: Path, method: str = "nrfgs", *options: Any, device="cpu", mode="val"):

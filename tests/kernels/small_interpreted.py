@@ -13,8 +13,8 @@ from test_against_twin import scenes
 from tile_list_cases import Splats, assert_lists, splats
 from torch.testing import assert_close
 
-from nrfgs_ns.densification.statistics import Maxima, Step, add_in_torch, raise_in_torch
-from nrfgs_ns.densification.statistics_triton import add, raise_maxima
+from nrfgs_ns.densification.statistics import Step, Tables, in_torch
+from nrfgs_ns.densification.statistics_triton import take
 from nrfgs_ns.image import ssim_triton
 from nrfgs_ns.image.ssim import photometric_loss
 from nrfgs_ns.rasterizer import TILE_SIZE, gsplat_cuda
@@ -45,36 +45,23 @@ def test_one_window_and_upstream_gradient(monkeypatch):
 
 
 # The growth's statistics.
-@pytest.mark.parametrize("names", [("grad2d", "count"), ("grad2d", "count", "radii")])
+@pytest.mark.parametrize("wanted", [(True, True, True), (False, True, True), (True, False, True), (True, True, False)])
+@pytest.mark.parametrize("sums", [True, False])
 @pytest.mark.parametrize("visible", [0, 1, 300])
-def test_the_kernel_adds_what_its_twin_adds(names, visible):
-    torch.manual_seed(0)
-    rows = torch.randperm(400)[:visible].sort().values
-    gradients, radii = torch.randn(visible, 2), torch.randint(0, 5, (visible,), dtype=torch.int32)
-    mine = {name: torch.rand(400) for name in names}
-    theirs = {name: value.clone() for name, value in mine.items()}
-    step = Step(rows, radii, 800.0, (400.0, 300.0))
-    add(mine, step, gradients)
-    add_in_torch(theirs, step, gradients)
-    for name in names:
-        assert_close(mine[name], theirs[name], rtol=1e-6, atol=0.0)
-
-
-@pytest.mark.parametrize("grows", [True, False])
-@pytest.mark.parametrize("peak", [True, False])
-@pytest.mark.parametrize("visible", [0, 1, 300])
-def test_the_kernel_raises_what_its_twin_raises(grows, peak, visible):
+def test_the_kernel_remembers_what_its_twin_remembers(wanted, sums, visible):
     torch.manual_seed(0)
     rows, radii = torch.randperm(400)[:visible], torch.randint(0, 5, (visible,), dtype=torch.int32)
-    gradients, change = torch.randn(visible, 2) if grows else None, torch.rand(visible) - 0.5 if peak else None
-    errors, changes = torch.rand(400) * 300 if grows else None, torch.rand(400) - 1.0 if peak else None
-    mine = Maxima(torch.rand(400) / 50, errors, changes)
-    theirs = Maxima(*(None if value is None else value.clone() for value in mine))
-    step = Step(rows, radii, 400.0, (400.0, 300.0))
-    raise_maxima(mine, step, gradients, change)
-    raise_in_torch(theirs, step, gradients, change)
+    gradients, change = torch.randn(visible, 2), torch.rand(visible) - 0.5
+    gradients[::7, 0], gradients[1::7, 1], change[2::7] = torch.nan, torch.inf, torch.nan
+    tables = torch.rand(400) / 50, torch.rand(400) * 300, torch.rand(400) - 1.0
+    mine = Tables(*(table if want else None for table, want in zip(tables, wanted, strict=True)))
+    theirs = Tables(*(None if value is None else value.clone() for value in mine))
+    shown = Step(rows, radii, 400.0, (400.0, 300.0)), gradients, None if sums else change, sums
+    take(mine, *shown)
+    in_torch(theirs, *shown)
     for value, twin in zip(mine, theirs, strict=True):
         if twin is not None:
+            assert torch.isfinite(twin).all()
             assert_close(value, twin, rtol=1e-6, atol=0.0)
 
 

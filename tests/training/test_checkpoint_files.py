@@ -16,7 +16,7 @@ from short_trainings import config_with
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.method_config import nrfgs
 from nrfgs_ns.training.checkpoint_files import Damaged, DiskFull, find, read, read_latest, read_or_refuse, write
-from nrfgs_ns.training.identity import check_options, check_scene, options_of, scene_of
+from nrfgs_ns.training.identity import check_data_set, check_options, data_set_of, options_of
 
 
 def content(step: int, size: int = 500) -> dict:
@@ -155,7 +155,7 @@ def scene(names=("a.png", "b.png", "c.png"), shift: float = 0.0) -> dict:
     poses = torch.eye(4)[None, :3].repeat(len(names), 1, 1)
     poses[:, 0, 3] = torch.arange(len(names))
     poses[1, 1, 3] += shift
-    return scene_of(list(names), SimpleNamespace(camera_to_worlds=poses))
+    return data_set_of(list(names), SimpleNamespace(camera_to_worlds=poses))
 
 
 @pytest.mark.parametrize(("here", "message"), [
@@ -164,9 +164,9 @@ def scene(names=("a.png", "b.png", "c.png"), shift: float = 0.0) -> dict:
     (scene(shift=0.1), r"other poses \(b.png elsewhere\)"),
 ])  # fmt: skip
 def test_another_scene_is_refused(here, message):
-    check_scene(scene(), scene(shift=1e-4), "elsewhere")
+    check_data_set(scene(), scene(shift=1e-4), "elsewhere")
     with pytest.raises(InputError, match=message):
-        check_scene(scene(), here, "data/fox")
+        check_data_set(scene(), here, "data/fox")
 
 
 @pytest.mark.parametrize("name, value, may_change", [

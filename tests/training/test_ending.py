@@ -46,10 +46,10 @@ def at_step(trainer: NrfgsTrainer, step: int, then) -> None:
     """Call `then` in the middle of a step."""
     original = trainer.pipeline.get_train_loss_dict
 
-    def spoilt(now: int, graphs):
+    def spoilt(now: int, *how):
         if now == step:
             then()
-        return original(now, graphs)
+        return original(now, *how)
 
     trainer.pipeline.get_train_loss_dict = spoilt
 

@@ -44,8 +44,8 @@ def poison(trainer, at: int, name: str, value: float, row: int = 7) -> None:
     """Put a value into the gradient of a per-splat tensor, or into the loss if the name is "loss", at one step."""
     model, original = trainer.pipeline.model, trainer.pipeline.get_train_loss_dict
 
-    def spoilt(step, graphs):
-        outputs, losses, metrics = original(step, graphs)
+    def spoilt(step, *how):
+        outputs, losses, metrics = original(step, *how)
         if step == at and name == "loss":
             losses["main_loss"] = losses["main_loss"] * value
             model.watched["loss main_loss"] = losses["main_loss"].detach()

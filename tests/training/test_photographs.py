@@ -14,7 +14,7 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.overlap import Pairs, estimate
 from nrfgs_ns.image.photograph import BASIS, exposed
 from nrfgs_ns.trained.loading import load_model
-from nrfgs_ns.training.photographs import Evidence, exif_of, exposure
+from nrfgs_ns.training.photographs import exif_of, exposure, they_differ
 
 NAN = math.nan
 
@@ -44,8 +44,7 @@ CENTERS = torch.arange(11.0)[:, None] * torch.tensor([1.0, 0.0, 0.0])
 ])  # fmt: skip
 def test_the_evidence_decides(pairs, known, wanted):
     seen = estimate(pairs, torch.full((11,), NAN), CENTERS)
-    evidence = Evidence(pairs, CENTERS, torch.tensor(known), seen)
-    assert evidence.calls_for_learning == wanted
+    assert they_differ(pairs, torch.tensor(known), seen) == wanted
 
 
 def test_exposure_in_stops_of_exif_from_the_data_set_or_else_from_the_file(tmp_path):
