@@ -74,15 +74,21 @@ def changes(trials: dict[str, str], sitting: str) -> str:
     return grid(["", *VIEWS, "splats"], body)
 
 
-def trial_changes(sitting: str) -> str:
-    """Mean changes by all trials of a sitting against its default over splits: dB, with their standard error."""
+def trial_changes(sitting: str, middle: bool = False) -> str:
+    """Mean changes by all trials of a sitting against its default over splits: dB, with their standard error; or the
+    median changes and on how many splits SSIM is higher."""
     runs, changes = records("trials"), defaultdict(list)
     for key, one in runs.items():
         at, _, trial = one.get("name", "").partition(": ")
         base = runs.get(key.replace(trial, "default", 1)) if at == sitting else None
         if base and base is not one:
-            changes[trial].append(one["psnr"] - base["psnr"])
-    return "; ".join(f"{name} {signed(fmean(dB), 2)}±{stdev(dB) / len(dB) ** 0.5:.2f}" for name, dB in changes.items())
+            changes[trial].append((one["psnr"] - base["psnr"], one["ssim"] > base["ssim"]))
+    texts = []
+    for name, both in changes.items():
+        dB, higher = zip(*both, strict=True)
+        mean = f"{signed(fmean(dB), 2)}±{stdev(dB) / len(dB) ** 0.5:.2f}"
+        texts.append(f"{name} {signed(median(dB), 2)} dB, SSIM higher on {sum(higher)}" if middle else f"{name} {mean}")
+    return "; ".join(texts)
 
 
 def logit() -> str:
@@ -122,6 +128,6 @@ BLOCKS = {
     "captures.logit": logit,
     "tables.gaps": lambda: changes(GAPS, "gaps"),
     "tables.today": lambda: trial_changes("today"),
-    "tables.harmonics": lambda: trial_changes("today, harmonics"),
+    "tables.harmonics": lambda: trial_changes("today, harmonics", middle=True),
     "tables.scale": scale,
 }
