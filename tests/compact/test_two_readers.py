@@ -312,14 +312,18 @@ GROUPS = (headers, texts, containers, xz_streams, rans_streams, contents, whole_
 
 READ = """
 const heard = (bytes) => {
-  let scene = null, said = null, raw = false;
+  let parts;
   try {
-    scene = readScene(bytes, () => {});
+    parts = [...readScene(bytes, [])];
   } catch (error) {
-    [said, raw] = [error.message, !(error instanceof BadFile)];
+    return { said: error.message, raw: !(error instanceof BadFile) };
   }
-  const part = (values) => btoa(String.fromCharCode(...new Uint8Array(values.buffer).subarray(0, 6400)));
-  return scene ? { table: part(scene.table), latents: part(scene.latents) } : { said, raw };
+  const [{ scene }] = parts, table = parts.find((part) => part.table).table[1].slice(0, 16 * scene.count);
+  const { low, step } = scene.header.grids.latents, layers = parts.filter((part) => part.latents);
+  const value = (code, r) => low[r] + step[r] * code || 0;  // 0 beyond the rank
+  const row = (_, i) => layers.flatMap(({ latents: [, codes] }) => [...codes.subarray(4 * i, 4 * i + 4)]).map(value);
+  const text = (values) => btoa(String.fromCharCode(...new Uint8Array(values.buffer).subarray(0, 6400)));
+  return { table: text(table), latents: text(Float32Array.from(Array.from({ length: scene.count }, row).flat())) };
 };
 const cases = JSON.parse(require("fs").readFileSync("cases.json", "utf-8"));
 console.log(JSON.stringify(cases.map((text) => heard(new Uint8Array(Buffer.from(text, "base64"))))));

@@ -30,7 +30,8 @@ KINDS = {
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_kind_of_field_in_every_mode(kind, opened, tmp_path):
+def test_every_kind_of_field_in_every_mode(kind, opened, tmp_path, monkeypatch):
+    monkeypatch.setattr("nrfgs_ns.export.web.page.PART", 3 * 5000)  # the scene is in several parts
     scene, photographs = random_scene(tmp_path, *KINDS[kind])
     (tmp_path / "page.html").write_text(page_with(scene.read_bytes(), photographs))
     page = opened((tmp_path / "page.html").as_uri())
@@ -46,8 +47,7 @@ def test_every_kind_of_field_in_every_mode(kind, opened, tmp_path):
 def test_a_device_that_lacks_memory_or_float_targets(opened, tmp_path):
     scene, photographs = random_scene(tmp_path, *KINDS["antialiased"])
     text = page_with(scene.read_bytes(), photographs)
-    kept = "const LARGEST_KEPT = 2 ** 28;"
-    assert kept in text
+    assert (kept := "const LARGEST_KEPT = 2 ** 28;") in text
     (tmp_path / "small.html").write_text(text.replace(kept, "const LARGEST_KEPT = 0;"))
     (tmp_path / "page.html").write_text(text)
     no_floats = (
@@ -96,8 +96,7 @@ def test_a_page_asks_the_network_for_nothing_and_works_in_a_frame(demo, opened, 
 
 def test_a_broken_page_says_so(demo, browser, tmp_path):
     text = demo[1].read_text(encoding="utf-8")
-    at = text.index('id="packed"')
-    start, middle = text.index(">", at) + 1, at + (len(text) - at) // 2
+    start, middle = text.index(">", at := text.index('id="packed"')) + 1, at + (len(text) - at) // 2
     scene = base64.b64decode(text[start : text.index("<", start)])
     later = base64.b64encode(scene[:8] + (9).to_bytes(4, "little") + scene[12:]).decode()
     unparsable = text.replace("async function", "async async function", 1)
@@ -140,8 +139,7 @@ def test_a_browser_that_lacks_something_says_so_in_a_sentence(said, before, demo
 
 
 def test_a_folder_on_a_web_server(opened, browser, tmp_path):
-    folder = tmp_path / "served"
-    folder.mkdir()
+    (folder := tmp_path / "served").mkdir()
     scene, photographs = random_scene(folder, *KINDS["as trained by default"])
     (folder / "index.html").write_text(page_with("scene.nrf", photographs))
     with web_server(folder) as address:

@@ -351,39 +351,37 @@ function tell(text, progress) {
 async function packedBytes() {
   const packed = byId("packed");
   if (!packed) throw new BadFile("The page is cut short: its scene is not in it.");
-  const text = packed.textContent.trim();
-  if (text.endsWith(".nrf")) return fetched(text);
-  packed.textContent = "";
+  if (packed.textContent.endsWith(".nrf")) return fetched(packed.textContent);
+  const parts = document.querySelectorAll('[type="text/plain"]');
+  let letters = 0, at = 0;
+  for (const part of parts) letters += part.textContent.length;
+  const bytes = new Uint8Array(Math.ceil(0.75 * letters));
   try {
-    if (Uint8Array.fromBase64) return Uint8Array.fromBase64(text);
-    const raw = atob(text), bytes = new Uint8Array(raw.length);
-    for (let i = 0; i < raw.length; i++) bytes[i] = raw.charCodeAt(i);
-    return bytes;
+    for (const part of parts) {
+      const text = part.textContent, rest = bytes.subarray(at);
+      part.textContent = "";
+      if (rest.setFromBase64) at += rest.setFromBase64(text).written;
+      else for (const letter of atob(text)) bytes[at++] = letter.charCodeAt(0);
+    }
   } catch {
     throw new BadFile("The page is damaged or cut short: its scene cannot be read.");
   }
+  return bytes.subarray(0, at);
 }
 
-async function fetched(name) {
-  const answer = await fetch(name).catch(() => null);
-  if (!answer?.ok) {
-    throw new BadFile(`${name} cannot be loaded. It must lie beside this page on a web server; a page of one file needs none.`);
-  }
-  const total = Number(answer.headers.get("content-length")), parts = [];
-  let size = 0;
-  for (const stream = answer.body.getReader(); ; ) {
-    const { done, value } = await stream.read();
-    if (done) break;
-    parts.push(value);
-    size += value.length;
-    if (total) tell("Loading", Math.min(1, size / total));
-  }
-  const bytes = new Uint8Array(size);
-  for (let at = 0; parts.length; ) {
-    bytes.set(parts[0], at);
-    at += parts.shift().length;
-  }
-  return bytes;
+// XMLHttpRequest gives all of the bytes at once, where a stream of `fetch` leaves parts lying in memory.
+function fetched(name) {
+  return new Promise((resolve, reject) => {
+    const request = new XMLHttpRequest();
+    request.responseType = "arraybuffer";
+    request.onprogress = ({ lengthComputable, loaded, total }) => lengthComputable && tell("Loading", loaded / total);
+    request.onloadend = () => {
+      if (request.status === 200) resolve(new Uint8Array(request.response));
+      else reject(new BadFile(`${name} cannot be loaded. It must lie beside this page on a web server; a page of one file needs none.`));
+    };
+    request.open("GET", name);
+    request.send();
+  });
 }
 
 // Reads and sorts in a worker, or here where there is none.
@@ -395,7 +393,11 @@ function startReader() {
     picked: (along) => picking(along),
   };
   const receive = (message) => {
-    for (const [name, value] of Object.entries(message)) handlers[name](value);
+    try {
+      for (const [name, value] of Object.entries(message)) handlers[name](value);
+    } catch (error) {
+      fail(error);
+    }
   };
   let post;
   try {
@@ -410,9 +412,20 @@ function startReader() {
   }
   return {
     post,
+    // A promise of what draws the scene.
     read: (bytes) => new Promise((resolve) => {
-      handlers.scene = resolve;
-      post({ read: bytes.buffer }, [bytes.buffer]);
+      let made = null;
+      const take = (set) => ([place, values]) => {
+        made?.[set](place, values);
+        post({ spent: values.buffer }, [values.buffer]);
+      };
+      Object.assign(handlers, {
+        scene: (scene) => (made = new Painter(canvas, scene)),
+        table: take("setTable"),
+        latents: take("setLatents"),
+        read: () => made && resolve(made.complete()),
+      });
+      post({ read: bytes }, [bytes.buffer]);
     }),
   };
 }
@@ -420,11 +433,10 @@ function startReader() {
 async function main() {
   offer();
   reader = startReader();
-  const scene = await reader.read(await packedBytes());
+  painter = await reader.read(await packedBytes());
   tell("Preparing", 1);
   fit();
-  painter = new Painter(canvas, scene);
-  byId("count").textContent = `${scene.count.toLocaleString("en")} splats.`;
+  byId("count").textContent = `${painter.count.toLocaleString("en")} splats.`;
   listen();
   const asked = readAddress();
   wake();

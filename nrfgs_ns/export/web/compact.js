@@ -11,7 +11,9 @@ const LARGEST_RATIO = 32, SMALL = 2 ** 24;  // what a file may unpack to: times 
 const LARGEST = 1e18;  // of an option, and of the unit of length
 const TABLES = new Map([["means", ["uint32"]], ["splats", ["int16", "int32"]], ["latents", ["int16", "int32"]]]);
 const WIDTHS = { means: 3, opacities: 1, scales: 3, colors: 3, turns: 3 };  // numbers of a splat in each grid
-const SH_C0 = 0.28209479177387814;
+const SH_C0 = 0.28209479177387814, { imul } = Math;
+const ARRAYS = { int16: Int16Array, int32: Int32Array, uint32: Uint32Array };
+const WIDTH = 4096;  // texels of a texture's row
 
 // The field's options, and what is assumed of one that a file leaves out.
 const OPTIONS = {
@@ -46,16 +48,18 @@ function hasKeys(value, keys, optional = []) {
   return keys.every((key) => own.includes(key)) && own.every((key) => keys.includes(key) || optional.includes(key));
 }
 
-// The scene in a file's bytes; BadFile where docs/compact-format.md has a file refused. `progress` is told the share
-// that is done.
-//   table    Float32Array [N, 16]: mean, logit of opacity; rotation (w, x, y, z); standard deviations, 0; base colour, 0
-//   latents  Float32Array [N, rank filled up to a multiple of 4]
-//   weights  name -> {shape, values}
-function readScene(bytes, progress) {
+// Reads a file's bytes; BadFile where docs/compact-format.md has a file refused. Yields one of these at a time:
+//   {progress}                 the share that is done
+//   {scene}                    {header, count, weights}; weights: name -> {shape, values}
+//   {table: [first, rows]}     Float32Array, the table from splat `first` on, filled up to whole rows of a texture: mean,
+//                              logit of opacity; rotation (w, x, y, z); standard deviations, 0; base colour, 0
+//   {latents: [layer, codes]}  four numbers of each splat's latent, in steps of their grids, filled up likewise
+// so that only a part of the scene lies in memory. `spare`: the last two's buffers, to be used again.
+function* readScene(bytes, spare) {
   try {
-    const { header, streams } = readContainer(bytes, progress);
+    const { header, streams } = readContainer(bytes);
     checkHeader(header);
-    return sceneOf(header, streams);
+    yield* sceneOf(header, streams, spare);
   } catch (error) {
     if (error instanceof BadFile) throw error;
     throw new BadFile(UNREADABLE);
@@ -114,8 +118,11 @@ function shapesOf(config) {
   return shapes;
 }
 
-function sceneOf(header, streams) {
-  const count = header.splats, { config } = header.head, rank = config.latent_dim;
+// Gives arrays' memory back at once, where a browser can.
+const free = (arrays) => arrays.forEach(({ buffer }) => buffer.transfer?.(0));
+
+function* sceneOf(header, streams, spare) {
+  const count = header.splats, { config } = header.head, rank = config.latent_dim, weights = {};
   const shapes = shapesOf(config).set("means", [2, count]).set("splats", [10, count]).set("latents", [rank, count]);
   expect(streams.size === shapes.size, "it has other streams than its field needs");
   for (const [name, shape] of shapes) {
@@ -124,23 +131,48 @@ function sceneOf(header, streams) {
     expect(stream.coding === (table ? "rans" : "xz"), `its ${name} is in another coding`);
     expect((table ?? ["float16", "float32"]).includes(stream.dtype), `its ${name} holds other numbers`);
   }
-  const scene = {
-    header, count, weights: {},
-    table: new Float32Array(16 * count),
-    latents: new Float32Array(4 * Math.ceil(rank / 4) * count),
-  };
   for (const [name, stream] of streams) {
     if (TABLES.has(name)) continue;
     const values = stream.dtype === "float32" ? new Float32Array(numbers(stream).buffer) : halves(numbers(stream));
     expect(values.every(Number.isFinite), `its ${name} is not finite`);
-    scene.weights[name.slice("head.".length)] = { shape: stream.shape, values };
+    weights[name.slice("head.".length)] = { shape: stream.shape, values };
   }
-  readTables(streams, scene, rank);
-  return scene;
+  yield { scene: { header, count, weights } };
+  const latents = streams.get("latents"), Codes = ARRAYS[latents.dtype];
+  const rows = Math.ceil(count / WIDTH), part = 1024 * Math.ceil(rows / 2);
+  const size = 4 * WIDTH * rows * Codes.BYTES_PER_ELEMENT;  // bytes of a layer, and of `part` splats' rows or more
+  const buffer = () => spare.pop() ?? new ArrayBuffer(Math.max(size, 64 * part));
+  const columns = [];
+  for (const name of ["means", "splats"]) {
+    for (const write of decodeTable(streams.get(name))) {
+      const column = new ARRAYS[streams.get(name).dtype](count);
+      write(column, 0, 1);
+      columns.push(column);
+      yield { progress: columns.length / (12 + rank) };
+    }
+  }
+  expect(columns[0].every((upper) => upper < 2 ** 31), "its means are beyond 63 bits");
+  const place = { upper: 0, lower: 0 };
+  for (let first = 0; first < count; first += part) {
+    const table = new Float32Array(buffer(), 0, 16 * Math.min(part, 1024 * Math.ceil((count - first) / 1024)));
+    const here = columns.map((column) => column.subarray(first, first + part));
+    fillTable(table, header.grids, place, here);
+    yield { table: [first, table] };
+  }
+  free(columns);
+  const { low, step } = header.grids.latents;
+  let r = 0, codes;
+  for (const write of decodeTable(latents)) {
+    if (r % 4 === 0) codes = new Codes(buffer(), 0, 4 * WIDTH * rows);
+    const ends = write(codes, r % 4, 4).map((code) => Math.fround(low[r] + step[r] * code));
+    expect(ends.every(Number.isFinite), "its latents are not finite");
+    if (++r % 4 === 0 || r === rank) yield { latents: [(r - 1) >> 2, codes] };
+    yield { progress: (12 + r) / (12 + rank) };
+  }
 }
 
-// The header, and name -> {coding, dtype, shape; columns or planes}.
-function readContainer(bytes, progress) {
+// The header, and name -> {coding, dtype, shape, body}, with checksums that hold.
+function readContainer(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
   if (bytes.length < 28 || MAGIC.some((byte, i) => bytes[i] !== byte)) {
     throw new BadFile("The page does not hold a scene of nrfgs, or only a part of one.");
@@ -172,70 +204,68 @@ function readContainer(bytes, progress) {
     const body = bytes.subarray(at, at + size);
     at += size;
     expect(body.length === size && crc32(body) === entry.crc32, `the checksum of its stream ${name} does not hold`);
-    const stream = { coding, dtype, shape };
-    if (coding === "rans") stream.columns = decodeTable(body, shape, dtype);
-    else stream.planes = unxz(body, BYTES[dtype] * shape.reduce((a, b) => a * b, 1));
-    streams.set(name, stream);
-    progress(at / total);
+    streams.set(name, { coding, dtype, shape, body });
   }
   expect(at === total, "it goes on after its last stream");
   return { header, streams };
 }
 
-function readTables(streams, scene, rank) {
-  const [means, splats, latents] = ["means", "splats", "latents"].map((name) => streams.get(name).columns);
-  const n = scene.count, { grids } = scene.header, { table } = scene;
-  expect(means[0].every((upper) => upper < 2 ** 31), "its means are beyond 63 bits");
-  readPlaces(means[1], means[0], grids.means, table);
-  // `stored` is what Python keeps of a value, and must be finite in float32; `drawn` what the page keeps.
-  const same = (x) => x;
-  const put = (column, { low, step }, c, offset, stored = same, drawn = same) => {
+// Rows of the table of splats whose columns are given; `place` as in readPlaces.
+function fillTable(table, grids, place, [uppers, lowers, ...splats]) {
+  const n = lowers.length, { low, step } = grids.turns;
+  table.fill(0);
+  readPlaces(place, lowers, uppers, grids.means, table);
+  // `scaled`: of a value that Python keeps otherwise, and that must be finite in float32.
+  const put = (column, { low, step }, c, offset, scaled = false) => {
     for (let i = 0; i < n; i++) {
       const value = low[c] + step[c] * column[i];
-      expect(Number.isFinite(Math.fround(stored(value))), "its splats are not finite");
-      table[16 * i + offset] = drawn(value);
+      expect(Number.isFinite(Math.fround(scaled ? (value - 0.5) / SH_C0 : value)), "its splats are not finite");
+      table[16 * i + offset] = value;
     }
   };
   put(splats[0], grids.opacities, 0, 3);
   for (let c = 0; c < 3; c++) {
-    put(splats[1 + c], grids.scales, c, 8 + c, same, Math.exp);
-    put(splats[4 + c], grids.colors, c, 12 + c, (x) => (x - 0.5) / SH_C0);
+    put(splats[1 + c], grids.scales, c, 8 + c);
+    put(splats[4 + c], grids.colors, c, 12 + c, true);
   }
-  const turns = splats.slice(7), { low, step } = grids.turns;
   for (let i = 0; i < n; i++) {
-    const [x, y, z] = turns.map((column, c) => low[c] + step[c] * column[i]);
+    const at = 16 * i;
+    const x = low[0] + step[0] * splats[7][i], y = low[1] + step[1] * splats[8][i], z = low[2] + step[2] * splats[9][i];
     const w = Math.sqrt(Math.max(1 - (x * x + y * y + z * z), 1e-6)), norm = Math.sqrt(w * w + x * x + y * y + z * z);
-    table.set([w / norm, x / norm, y / norm, z / norm], 16 * i + 4);
-    for (const c of [0, 1, 2, 4, 5, 6, 7]) expect(Number.isFinite(table[16 * i + c]), "its splats are not finite");
+    table[at + 4] = w / norm;
+    table[at + 5] = x / norm;
+    table[at + 6] = y / norm;
+    table[at + 7] = z / norm;
+    let sum = 0;  // finite if all are: their squares fit into float64
+    for (let c = 0; c < 8; c++) sum += table[at + c] ** 2;
+    expect(Number.isFinite(sum), "its splats are not finite");
+    for (let c = 8; c < 11; c++) table[at + c] = Math.exp(table[at + c]);
   }
-  const width = 4 * Math.ceil(rank / 4);
-  for (let r = 0; r < rank; r++) {
-    const column = latents[r], low = grids.latents.low[r], step = grids.latents.step[r];
-    for (let i = 0; i < n; i++) scene.latents[width * i + r] = low + step * column[i];
-  }
-  expect(scene.latents.every(Number.isFinite), "its latents are not finite");
 }
 
-let crcTable = null;
+// By a byte: what it does to a checksum with no, one, two and three bytes behind it.
+const CRC = new Int32Array(4 * 256);
+for (let n = 0; n < 256; n++) {
+  for (let k = 0, c = n; k < 32; k++) {
+    c = c & 1 ? 0xedb88320 ^ (c >>> 1) : c >>> 1;
+    CRC[256 * (k >> 3) + n] = c;
+  }
+}
 
 function crc32(bytes) {
-  if (!crcTable) {
-    crcTable = new Uint32Array(256);
-    for (let n = 0; n < 256; n++) {
-      let c = n;
-      for (let k = 0; k < 8; k++) c = c & 1 ? 0xedb88320 ^ (c >>> 1) : c >>> 1;
-      crcTable[n] = c;
-    }
+  const words = bytes.length & ~3;
+  let crc = -1, i = 0;
+  for (; i < words; i += 4) {
+    crc ^= bytes[i] | (bytes[i + 1] << 8) | (bytes[i + 2] << 16) | (bytes[i + 3] << 24);
+    crc = CRC[768 + (crc & 255)] ^ CRC[512 + ((crc >>> 8) & 255)] ^ CRC[256 + ((crc >>> 16) & 255)] ^ CRC[crc >>> 24];
   }
-  let crc = -1;
-  for (let i = 0; i < bytes.length; i++) crc = crcTable[(crc ^ bytes[i]) & 255] ^ (crc >>> 8);
+  for (; i < bytes.length; i++) crc = CRC[(crc ^ bytes[i]) & 255] ^ (crc >>> 8);
   return (crc ^ -1) >>> 0;
 }
 
-// A stream's numbers: of one byte or two as they are, of four as Uint32Array.
-function numbers({ dtype, planes }) {
-  const size = BYTES[dtype], n = planes.length / size;
-  if (size === 1) return planes;
+// The numbers of a stream of "xz": of two bytes as Uint16Array, of four as Uint32Array.
+function numbers({ dtype, shape, body }) {
+  const size = BYTES[dtype], n = shape.reduce((a, b) => a * b, 1), planes = unxz(body, size * n);
   const out = size === 2 ? new Uint16Array(n) : new Uint32Array(n);
   for (let k = 0; k < size; k++) for (let i = 0; i < n; i++) out[i] |= planes[k * n + i] << (8 * k);
   return out;
@@ -258,9 +288,10 @@ function thirds(x) {
   return (x ^ (x >>> 16)) & 0x3ff;
 }
 
-// Running sums of 64-bit differences, given as lower and upper 32 bits, and the coordinates whose bits alternate in them.
-function readPlaces(lowers, uppers, { low, step }, table) {
-  let lower = 0, upper = 0;
+// Running sums, on top of `place`, of 64-bit differences, given as lower and upper 32 bits, and the coordinates whose
+// bits alternate in them.
+function readPlaces(place, lowers, uppers, { low, step }, table) {
+  let { lower, upper } = place;
   for (let i = 0; i < lowers.length; i++) {
     const sum = lower + lowers[i];
     const carry = sum >= 2 ** 32 ? 1 : 0;
@@ -272,125 +303,151 @@ function readPlaces(lowers, uppers, { low, step }, table) {
       table[16 * i + a] = low[a] + step[a] * code;
     }
   }
+  Object.assign(place, { lower, upper });
 }
 
 // ---- coded tables: rANS in lanes, as entropy.py's docstring has it. Whole numbers alone, so that every reader agrees.
 
-const PRECISION = 14, LOWEST = 1 << 16, DIRECT = 32, TOKENS = 140, MOST_ACTIVITY = 4 * 16 * 139;
+const PRECISION = 14, MASK = (1 << PRECISION) - 1, LOWEST = 1 << 16, DIRECT = 32, TOKENS = 140, MOST_ACTIVITY = 4 * 16 * 139;
 const MOST_CONTEXTS = 16, MOST_MODEL = 13 + MOST_CONTEXTS * (3 + TOKENS), LARGEST_WEIGHT = 1 << 16;
 
-// The columns of a table: Uint32Array for uint32, else Int32Array.
-function decodeTable(body, shape, dtype) {
-  const broken = () => new BadFile("The scene is damaged: one of its tables cannot be decoded.");
-  if (shape.length !== 2 || shape[0] > 1024 || body.length < 8) throw broken();
+// Decodes a table; yields for each column write(out, first, stride), which puts the number of row i at first + i stride of
+// an array, and returns the least and the largest of a signed column.
+function* decodeTable({ body, shape, dtype }) {
+  const hold = (right) => expect(right, "one of its tables cannot be decoded");
+  hold(shape.length === 2 && shape[0] <= 1024 && body.length >= 8);
   const [C, n] = shape, view = new DataView(body.buffer, body.byteOffset, body.byteLength);
   const lowest = { int16: -(2 ** 15), int32: -(2 ** 31), uint32: 0 }[dtype];
   const highest = { int16: 2 ** 15 - 1, int32: 2 ** 31 - 1, uint32: 2 ** 32 - 1 }[dtype];
   const count = view.getUint32(0, true), size = view.getUint32(4, true);
-  if (count > MOST_MODEL * C || 8 + size > body.length) throw broken();
-  const model = new Int32Array(numbers({ dtype: "int32", planes: unxz(body.subarray(8, 8 + size), 4 * count) }).buffer);
+  hold(count <= MOST_MODEL * C && 8 + size <= body.length);
+  const model = new Int32Array(numbers({ dtype: "uint32", shape: [count], body: body.subarray(8, 8 + size) }).buffer);
   let read = 0;
   const take = () => {
-    if (read >= count) throw broken();
+    hold(read < count);
     return model[read++];
   };
   let lanes = 1;
   while (lanes < Math.min(1024, Math.ceil((C * n) / 2048))) lanes *= 2;
-  const S = Math.ceil(n / lanes), state = new Uint32Array(lanes);
+  const S = Math.ceil(n / lanes), state = new Int32Array(lanes), words = new Uint16Array(2 ** 15);
   let at = 8 + size;
-  if (at + 4 * lanes > body.length) throw broken();
-  for (let l = 0; l < lanes; l++, at += 4) state[l] = view.getUint32(at, true);
-  if (state.some((x) => x < LOWEST)) throw broken();
-  const word = () => {
-    at += 2;
-    if (at > body.length) throw broken();
-    return body[at - 2] | (body[at - 1] << 8);
-  };
+  hold(at + 4 * lanes <= body.length && (body.length - at) % 2 === 0);
+  for (let l = 0; l < lanes; l++, at += 4) state[l] = view.getInt32(at, true);
+  hold(state.every((x) => x >>> 16 > 0));
+  // `words`: the next ones, from the w-th on, with zeros behind the last. A step takes up to three for each lane.
+  const coder = { state, words, w: words.length, most: 0 }, raw = new Uint8Array(words.buffer);
+  at -= raw.length;
 
-  const columns = [], zeros = new Int32Array(n);
-  const tokens = [new Uint8Array(n), new Uint8Array(n), new Uint8Array(n)];  // of a column and the two to its left
+  // Of a column and two to its left, in the order of decoding: row l S + t at (2 + t) lanes + l.
+  const columns = [0, 1, 2].map(() => new (dtype === "uint32" ? Uint32Array : Int32Array)((2 + S) * lanes));
+  const tokens = columns.map((column) => new Uint8Array(column.length));
+  const chances = new Int32Array(MOST_CONTEXTS << 8);  // by context and token: its frequency, and 14 bits of its start
+  const lookup = new Uint8Array(MOST_CONTEXTS << PRECISION), context = new Uint8Array(MOST_ACTIVITY + 1);
   for (let c = 0; c < C; c++) {
     const signed = take() !== 0;
     const weights = Array.from({ length: 7 }, take), shares = Array.from({ length: 4 }, take);
     const contexts = take();
-    if (contexts < 0 || contexts >= MOST_CONTEXTS || weights.some((w) => Math.abs(w) > LARGEST_WEIGHT)) throw broken();
+    hold(contexts >= 0 && contexts < MOST_CONTEXTS && weights.every((w) => Math.abs(w) <= LARGEST_WEIGHT));
     const thresholds = Array.from({ length: contexts }, take);
-    if (thresholds.some((value, k) => k > 0 && value <= thresholds[k - 1])) throw broken();
-    const frequencies = new Uint16Array((thresholds.length + 1) * TOKENS), starts = new Uint16Array(frequencies.length);
-    const lookup = new Uint8Array((thresholds.length + 1) << PRECISION);
-    for (let k = 0; k <= thresholds.length; k++) {
+    hold(thresholds.every((value, k) => k === 0 || value > thresholds[k - 1]));
+    for (let k = 0; k <= contexts; k++) {
       const first = take(), used = take();
       let sum = 0;
-      if (first < 0 || used <= 0 || first + used > TOKENS) throw broken();
+      hold(first >= 0 && used > 0 && first + used <= TOKENS);
       for (let token = first; token < first + used; token++) {
         const frequency = take();
-        if (frequency < 0 || sum + frequency > 1 << PRECISION) throw broken();
-        frequencies[k * TOKENS + token] = frequency;
-        starts[k * TOKENS + token] = sum;
+        hold(frequency >= 0 && sum + frequency <= 1 << PRECISION);
+        chances[(k << 8) + token] = (frequency << PRECISION) | sum;
         lookup.fill(token, (k << PRECISION) + sum, (k << PRECISION) + sum + frequency);
         sum += frequency;
       }
-      if (sum !== 1 << PRECISION) throw broken();
+      hold(sum === 1 << PRECISION);
     }
-    const context = new Uint32Array(MOST_ACTIVITY + 1);  // its number times 2^PRECISION, by activity
     for (let a = 0, k = 0; a <= MOST_ACTIVITY; a++) {
-      while (k < thresholds.length && thresholds[k] <= a) k++;
-      context[a] = k << PRECISION;
+      while (k < contexts && thresholds[k] <= a) k++;
+      context[a] = k;
     }
-    if (shares.some((share) => share < 0 || share > 16)) throw broken();
-    const [w0, w1, w2, w3, w4, w5, w6] = weights, [s1, s2, s3, s4] = shares;
-    const own = tokens[c % 3], out = dtype === "uint32" ? new Uint32Array(n) : new Int32Array(n);
-    const left = c > 0 ? columns[c - 1] : zeros, left2 = c > 1 ? columns[c - 2] : zeros;
-    const near = c > 0 ? tokens[(c + 2) % 3] : zeros, near2 = c > 1 ? tokens[(c + 1) % 3] : zeros;
+    hold(shares.every((share) => share >= 0 && share <= 16));
+    const [own, left, left2] = [0, 2, 1].map((k) => columns[(c + k) % 3]);
+    const [said, near, near2] = [0, 2, 1].map((k) => tokens[(c + k) % 3]);
     for (let t = 0; t < S; t++) {
-      const active = Math.ceil((n - t) / S);
-      // First all tokens of a step, then the low bits that they leave: words lie in this order.
-      let most = 0;
-      for (let l = 0, i = t; l < active; l++, i += S) {
-        const activity = s1 * (t > 0 ? own[i - 1] : 0) + s2 * (t > 1 ? own[i - 2] : 0) + s3 * near[i] + s4 * near2[i];
-        const k = context[activity], x = state[l], slot = x & ((1 << PRECISION) - 1), token = lookup[k + slot];
-        const entry = (k >>> PRECISION) * TOKENS + token;
-        const rest = frequencies[entry] * (x >>> PRECISION) + slot - starts[entry];
-        if (rest < LOWEST) {
-          state[l] = (rest << 16) | body[at] | (body[at + 1] << 8);
-          at += 2;
-        } else {
-          state[l] = rest;
-        }
-        own[i] = out[i] = token;
-        if (token > most) most = token;
+      const first = (2 + t) * lanes, active = Math.ceil((n - t) / S);
+      if (coder.w + 3 * lanes > words.length) {
+        at += 2 * coder.w;
+        raw.fill(0);
+        raw.set(body.subarray(at, at + raw.length));
+        coder.w = 0;
       }
-      if (at > body.length) throw broken();
-      if (most >= DIRECT) {
-        for (const shift of (most - DIRECT >> 2) + 3 > 16 ? [0, 16] : [0]) {
-          for (let l = 0, i = t; l < active; l++, i += S) {
-            const large = own[i] - DIRECT;
-            if (large < 0) continue;
-            const spare = (large >> 2) + 3, bits = Math.min(Math.max(spare - shift, 0), 16), scale = 2 ** bits;
-            if (shift === 0) out[i] = (4 + (large & 3)) * 2 ** spare;
-            let x = state[l];
-            out[i] += (x % scale) * 2 ** shift;
-            x = Math.floor(x / scale);
-            state[l] = x < LOWEST ? x * LOWEST + word() : x;
+      // First all tokens of a step, then the low bits that they leave: words lie in this order.
+      takeTokens(coder, first, active, lanes, shares, context, lookup, chances, own, said, near, near2);
+      if (coder.most >= DIRECT && takeBits(coder, first, active, own, said, 0)) takeBits(coder, first, active, own, said, 16);
+      hold(predict(weights, own, left, left2, first, active, lanes, signed, lowest, highest));
+    }
+    yield (out, first, stride) => {
+      let least = own[2 * lanes], most = least;
+      for (let t = 0; t < S; t += 16) {  // as many neighbours in memory at once
+        for (let l = 0; l < lanes; l++) {
+          for (let k = t, end = Math.min(t + 16, S, n - l * S); k < end; k++) {
+            const value = own[(2 + k) * lanes + l];
+            out[first + stride * (l * S + k)] = value;
+            least = Math.min(least, value);
+            most = Math.max(most, value);
           }
         }
       }
-      for (let l = 0, i = t; l < active; l++, i += S) {
-        const u = out[i] >>> 0, b = t > 0 ? i - 1 : -1;
-        let x = u;
-        if (signed) {
-          const sum = w0 + 128 + w1 * (t > 0 ? out[i - 1] : 0) + w2 * (t > 1 ? out[i - 2] : 0) +
-            w3 * left[i] + w4 * (b < 0 ? 0 : left[b]) + w5 * left2[i] + w6 * (b < 0 ? 0 : left2[b]);
-          x = Math.floor(sum / 256) + ((u >>> 1) ^ -(u & 1));
-        }
-        if (x < lowest || x > highest) throw broken();
-        out[i] = x;
-      }
-    }
-    columns.push(out);
+      return [least, most];
+    };
   }
-  if (at !== body.length || state.some((x) => x !== LOWEST) || read !== count) throw broken();
-  return columns;
+  hold(at + 2 * coder.w === body.length && state.every((x) => x === LOWEST) && read === count);
+  free([...columns, ...tokens]);
+}
+
+// The tokens of a step; coder.most: no less than the largest.
+function takeTokens(coder, first, active, lanes, [s1, s2, s3, s4], context, lookup, chances, own, said, near, near2) {
+  const { state, words } = coder;
+  let { w } = coder, most = 0;
+  for (let l = 0, j = first; l < active; l++, j++) {
+    const activity = imul(s1, said[j - lanes]) + imul(s2, said[j - 2 * lanes]) + imul(s3, near[j]) + imul(s4, near2[j]);
+    const k = context[activity], x = state[l], slot = x & MASK;
+    const token = lookup[(k << PRECISION) + slot];
+    const chance = chances[(k << 8) + token];
+    const rest = (imul(chance >>> PRECISION, x >>> PRECISION) + slot - (chance & MASK)) | 0;
+    const short = ((rest >>> 16) - 1) >>> 31;  // 1 if it is below 2^16: without a branch, which nobody could predict
+    state[l] = (rest << (short << 4)) | (words[w] & -short);
+    w += short;
+    said[j] = own[j] = token;
+    most |= token;
+  }
+  Object.assign(coder, { w, most });
+}
+
+// The low bits, from the bit `shift` on, that large tokens of a step leave; whether there are more.
+function takeBits(coder, first, active, own, said, shift) {
+  const { state, words } = coder;
+  let more = false;
+  for (let l = 0, j = first; l < active; l++, j++) {
+    const large = said[j] - DIRECT;
+    if (large < 0) continue;
+    const spare = (large >> 2) + 3, bits = Math.min(Math.max(spare - shift, 0), 16), x = state[l], rest = x >>> bits;
+    if (shift === 0) own[j] = (4 + (large & 3)) << spare;
+    own[j] += (x & ((1 << bits) - 1)) << shift;
+    state[l] = rest >>> 16 ? rest : (rest << 16) | words[coder.w++];
+    if (spare > 16) more = true;
+  }
+  return more;
+}
+
+// Numbers of a step from what was read and from their neighbours; whether all are in their type's range.
+function predict([w0, w1, w2, w3, w4, w5, w6], own, left, left2, first, active, lanes, signed, lowest, highest) {
+  for (let j = first, end = first + active; j < end; j++) {
+    const b = j - lanes, u = own[j];
+    const sum = w0 + 128 + w1 * own[b] + w2 * own[b - lanes] + w3 * left[j] + w4 * left[b] +
+      w5 * left2[j] + w6 * left2[b];
+    const x = signed ? Math.floor(sum / 256) + ((u >>> 1) ^ -(u & 1)) : u >>> 0;
+    if (x < lowest || x > highest) return false;
+    own[j] = x;
+  }
+  return true;
 }
 
 // ---- xz (https://tukaani.org/xz/xz-file-format.txt): one block of LZMA2 or none, without sizes and checks.
@@ -509,27 +566,7 @@ function lzma2(input, at, output, dictionary, broken) {
         offset &= b ? expected : ~expected;
       }
     } else {
-      // `bit` eight times, written out: most of a scene is literals, and this is where its time goes.
-      let range = coder[0], code = coder[1];
-      while (symbol < 0x100) {
-        const p = probs[base + symbol], bound = (range >>> 11) * p;
-        if (code < bound) {
-          range = bound;
-          probs[base + symbol] = p + ((2048 - p) >>> 5);
-          symbol <<= 1;
-        } else {
-          range -= bound;
-          code -= bound;
-          probs[base + symbol] = p - (p >>> 5);
-          symbol = (symbol << 1) | 1;
-        }
-        if (range < 0x1000000) {
-          range = (range << 8) >>> 0;
-          code = ((code << 8) | input[at++]) >>> 0;
-        }
-      }
-      coder[0] = range;
-      coder[1] = code;
+      while (symbol < 0x100) symbol = (symbol << 1) | bit(base + symbol);
     }
     output[filled++] = symbol;
     state = state < 4 ? 0 : state < 10 ? state - 3 : state - 6;

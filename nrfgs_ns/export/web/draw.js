@@ -105,7 +105,7 @@ const LARGEST_KEPT = 2 ** 28;  // bytes for what is kept of the first layers: be
 const GREY = [0.5, 0.5, 0.5];
 
 class Painter {
-  // canvas: to draw on. scene: of `readScene`.
+  // canvas: to draw on. scene: as `readScene` tells it; then come setTable, setLatents and, after all of these, complete.
   constructor(canvas, scene) {
     const gl = (this.gl = canvas.getContext("webgl2", {
       alpha: false, antialias: false, depth: false, stencil: false, powerPreference: "high-performance",
@@ -117,55 +117,80 @@ class Painter {
     this.header = scene.header;
     this.count = scene.count;
     this.background = scene.header.render.background;
-    this.near = scene.header.render.near_plane ?? 0.01 * scene.header.head.scene_unit;
+    this.near = scene.header.render.near_plane;
     this.largest = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     this.plan = plan(scene.header.head.config, scene.weights);
     if (this.largest < WIDTH || this._height(scene.count, TABLE_TEXELS) > this.largest) {
       throw new Lacking(`This device's textures are too small for ${scene.count.toLocaleString()} splats.`);
     }
 
-    this.table = this._floats(scene.table, TABLE_TEXELS, scene.count);
     this.rows = this._height(scene.count, TABLE_TEXELS);
+    this.table = this._texture(gl.RGBA32F, WIDTH, this.rows);
     this.looks = this._texture(gl.RGBA32UI, PER_ROW(TABLE_TEXELS), this.rows);
     this.looksTarget = this._target(this.looks);
-    this._buildField(scene);
+    this._startField(scene);
     this._buildSplats();
     this.show = this._program(WHOLE_VERTEX, SHOW_FRAGMENT);
     this.drawn = 0;
     this.target = null;
+  }
+
+  setTable(first, values) {
+    const { gl } = this, y = first / PER_ROW(TABLE_TEXELS);
+    gl.bindTexture(gl.TEXTURE_2D, this.table);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, y, WIDTH, values.length / (4 * WIDTH), gl.RGBA, gl.FLOAT, values);
+  }
+
+  setLatents(layer, codes) {
+    const { gl } = this, format = [gl.RGBA_INTEGER, codes.BYTES_PER_ELEMENT === 2 ? gl.SHORT : gl.INT];
+    gl.bindTexture(gl.TEXTURE_2D_ARRAY, this.latents);
+    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, layer, WIDTH, this.height, 1, ...format, codes);
+  }
+
+  // Computes what is kept of the first layers, once all is there; returns itself.
+  complete() {
+    const { gl, plan, own, keep } = this;
+    if (keep) {
+      const buffer = gl.createFramebuffer(), places = [0, 1, 2, 3].map((k) => gl.COLOR_ATTACHMENT0 + k);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, buffer);
+      gl.drawBuffers(places);
+      gl.disable(gl.BLEND);
+      gl.viewport(0, 0, WIDTH, this.height);
+      this._bind(keep, { table: this.table, latents: this.latents });
+      for (let layer = 0; layer < plan.layers; layer += 4) {
+        places.forEach((place, k) => gl.framebufferTextureLayer(gl.FRAMEBUFFER, place, this.kept, 0, layer + k));
+        this._check();
+        gl.uniform4fv(keep.at("own"), own.values, 4 * own.width * layer, 16 * own.width);
+        gl.drawArrays(gl.TRIANGLES, 0, 3);
+      }
+      gl.deleteFramebuffer(buffer);
+      gl.deleteProgram(keep.program);
+      gl.deleteTexture(this.latents);
+    }
     if (gl.getError() === gl.OUT_OF_MEMORY) throw new Lacking("This device's graphics memory is too small for the scene.");
+    return this;
   }
 
   _height(count, each) {
     return Math.max(1, Math.ceil(count / PER_ROW(each)));
   }
 
-  _buildField(scene) {
-    const { gl, plan } = this;
-    const own = ownWeights(plan, scene.weights), view = viewWeights(plan, scene.weights);
-    const room = gl.getParameter(gl.MAX_UNIFORM_BLOCK_SIZE);
+  _startField(scene) {
+    const { gl, plan } = this, short = scene.header.streams.find(({ name }) => name === "latents").dtype === "int16";
+    const view = viewWeights(plan, scene.weights), room = gl.getParameter(gl.MAX_UNIFORM_BLOCK_SIZE);
     if (view.byteLength > room) throw new Lacking(`This device's shaders have no room for ${view.length} weights.`);
-    const ownTexture = this._texture(gl.RGBA32F, own.width, plan.groups, own.values);
-    const latents = this._floats(scene.latents, plan.latentTexels, scene.count);
-    const height = this._height(scene.count, plan.groups);
-    const fits = this.exact && height <= this.largest && 8 * WIDTH * height <= LARGEST_KEPT;
-    this.kept = null;
+    const own = (this.own = ownWeights(plan, scene.weights, scene.header.grids.latents));
+    const height = (this.height = Math.ceil(scene.count / WIDTH));
+    this.latents = this._texture(short ? gl.RGBA16I : gl.RGBA32I, WIDTH, height, plan.latentTexels);
+    const fits = this.exact && 8 * WIDTH * height * plan.layers <= LARGEST_KEPT &&
+      plan.layers <= gl.getParameter(gl.MAX_ARRAY_TEXTURE_LAYERS) &&
+      4 * own.width <= gl.getParameter(gl.MAX_FRAGMENT_UNIFORM_VECTORS);
     if (fits) {
-      this.kept = this._texture(gl.RGBA16F, WIDTH, height);
-      const target = this._target(this.kept);
-      const keep = this._program(WHOLE_VERTEX, keepShader(plan, scene.count));
-      gl.useProgram(keep.program);
-      gl.disable(gl.BLEND);
-      this._bind(keep, { table: this.table, latents, ownWeights: ownTexture });
-      gl.viewport(0, 0, WIDTH, height);
-      gl.drawArrays(gl.TRIANGLES, 0, 3);
-      gl.deleteFramebuffer(target);
-      gl.deleteProgram(keep.program);
-      gl.deleteTexture(latents);
-      gl.deleteTexture(ownTexture);
+      this.kept = this._texture(gl.RGBA16F, WIDTH, height, plan.layers);
+      this.keep = this._program(WHOLE_VERTEX, keepShader(plan, own.width));
     } else {
-      this.latents = latents;
-      this.ownTexture = ownTexture;
+      this.ownTexture = this._texture(gl.RGBA32F, own.width, plan.layers);
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, own.width, plan.layers, gl.RGBA, gl.FLOAT, own.values);
     }
     this.look = this._program(WHOLE_VERTEX, lookShader(plan, scene.header, scene.count, fits));
     const block = gl.createBuffer();
@@ -262,27 +287,14 @@ class Painter {
     this.target = { width, height, texture, buffer: this._target(texture) };
   }
 
-  // A texture of numbers, `each` texels for a splat, filled up to whole rows.
-  _floats(values, each, count) {
-    const perRow = PER_ROW(each), height = this._height(count, each), rowLength = 4 * WIDTH;
-    const texture = this._texture(this.gl.RGBA32F, WIDTH, height);
-    const strip = new Float32Array(rowLength);
-    for (let row = 0; row < height; row++) {
-      const part = values.subarray(4 * each * perRow * row, 4 * each * Math.min(perRow * (row + 1), count));
-      strip.set(part);
-      this.gl.texSubImage2D(this.gl.TEXTURE_2D, 0, 0, row, WIDTH, 1, this.gl.RGBA, this.gl.FLOAT, strip);
-    }
-    return texture;
-  }
-
-  _texture(format, width, height, values = null) {
-    const { gl } = this;
-    const texture = gl.createTexture();
-    gl.bindTexture(gl.TEXTURE_2D, texture);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
-    if (values) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, height, gl.RGBA, gl.FLOAT, values);
-    for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
-    for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, side, gl.CLAMP_TO_EDGE);
+  // A texture; with layers, an array of them.
+  _texture(format, width, height, layers = 0) {
+    const { gl } = this, texture = gl.createTexture(), kind = layers ? gl.TEXTURE_2D_ARRAY : gl.TEXTURE_2D;
+    gl.bindTexture(kind, texture);
+    if (layers) gl.texStorage3D(kind, 1, format, width, height, layers);
+    else gl.texStorage2D(kind, 1, format, width, height);
+    for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(kind, side, gl.NEAREST);
+    for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(kind, side, gl.CLAMP_TO_EDGE);
     return texture;
   }
 
@@ -291,10 +303,15 @@ class Painter {
     const buffer = gl.createFramebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, buffer);
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
+    this._check();
+    return buffer;
+  }
+
+  _check() {
+    const { gl } = this;
     if (gl.checkFramebufferStatus(gl.FRAMEBUFFER) !== gl.FRAMEBUFFER_COMPLETE) {
       throw new Lacking("This device cannot draw into the textures that the scene needs.");
     }
-    return buffer;
   }
 
   _program(vertex, fragment) {
@@ -321,7 +338,7 @@ class Painter {
     gl.useProgram(program.program);
     Object.entries(textures).forEach(([name, texture], unit) => {
       gl.activeTexture(gl.TEXTURE0 + unit);
-      gl.bindTexture(gl.TEXTURE_2D, texture);
+      gl.bindTexture(name === "kept" || name === "latents" ? gl.TEXTURE_2D_ARRAY : gl.TEXTURE_2D, texture);
       gl.uniform1i(program.at(name), unit);
     });
     gl.activeTexture(gl.TEXTURE0);

@@ -29,17 +29,17 @@ function plan(config, weights) {
     branch.view = branch.inputs.filter((name) => !isOwn(name));
     first += branch.groups;
   }
-  return { config, branches, groups: first, latentTexels: Math.ceil(config.latent_dim / 4) };
+  return { config, branches, layers: GROUP * Math.ceil(first / GROUP), latentTexels: Math.ceil(config.latent_dim / 4) };
 }
 
 function isOwn(name) {
   return name.startsWith("z") || name.startsWith("c.") || name === "opacity";
 }
 
-// First layers of a splat's own numbers: for each group a row of texels, bias, colour (3), opacity, latent; each texel
-// holds the weights of four hidden units.
-function ownWeights(plan, weights) {
-  const width = 5 + 4 * plan.latentTexels, out = new Float32Array(4 * width * plan.groups);
+// First layers of a splat's own numbers: for each group a row of texels, bias, colour (3), opacity, latent, which is in
+// steps of its grids; each texel holds the weights of four hidden units.
+function ownWeights(plan, weights, { low, step }) {
+  const width = 5 + 4 * plan.latentTexels, out = new Float32Array(4 * width * plan.layers);
   const columns = ["bias", "c.r", "c.g", "c.b", "opacity"];
   for (let i = 0; i < 4 * plan.latentTexels; i++) columns.push(`z${i}`);
   for (const branch of plan.branches) {
@@ -48,9 +48,11 @@ function ownWeights(plan, weights) {
       const row = branch.first + (unit >> 2);
       columns.forEach((name, column) => {
         const input = branch.inputs.indexOf(name);
-        const value = name === "bias" ? bias.values[unit] : input < 0 ? 0 : layer.values[unit * branch.inputs.length + input];
-        out[4 * (row * width + column) + (unit & 3)] = value;
+        const weight = input < 0 ? 0 : layer.values[unit * branch.inputs.length + input];
+        out[4 * (row * width + column) + (unit & 3)] = weight * (step[column - 5] ?? 1);
       });
+      const add = (sum, value, r) => sum + value * layer.values[unit * branch.inputs.length + r];
+      out[4 * row * width + (unit & 3)] = low.reduce(add, bias.values[unit]);
     }
   }
   return { width, values: out };
@@ -87,25 +89,26 @@ precision highp float;
 precision highp int;
 precision highp sampler2D;
 precision highp usampler2D;
+precision highp sampler2DArray;
+precision highp isampler2DArray;
 `;
 
 // Where splat i's texels are, in a texture with `${each}` texels for a splat.
 const texel = (each) => `ivec2((i % ${PER_ROW(each)}) * ${each}, i / ${PER_ROW(each)})`;
-const WIDTH = 4096;
 const PER_ROW = (each) => Math.floor(WIDTH / each);
 const TABLE_TEXELS = 4;
 
 // What the splat's own numbers contribute to hidden units 4 j .. 4 j + 3.
 function ownPart(plan) {
   return `
-uniform sampler2D latents, ownWeights;
+uniform isampler2DArray latents;
+uniform sampler2D ownWeights;
 vec4 ownPart(int i, int j, vec4 color, float opacity) {
   vec4 h = texelFetch(ownWeights, ivec2(0, j), 0);
   for (int k = 0; k < 3; k++) h += texelFetch(ownWeights, ivec2(1 + k, j), 0) * color[k];
   h += texelFetch(ownWeights, ivec2(4, j), 0) * opacity;
-  ivec2 at = ${texel(plan.latentTexels)};
   for (int l = 0; l < ${plan.latentTexels}; l++) {
-    vec4 z = texelFetch(latents, at + ivec2(l, 0), 0);
+    vec4 z = vec4(texelFetch(latents, ivec3(${texel(1)}, l), 0));
     for (int k = 0; k < 4; k++) h += texelFetch(ownWeights, ivec2(5 + 4 * l + k, j), 0) * z[k];
   }
   return h;
@@ -113,18 +116,24 @@ vec4 ownPart(int i, int j, vec4 color, float opacity) {
 `;
 }
 
-function keepShader(plan, count) {
+// Four groups at once, `own` their weights.
+function keepShader(plan, width) {
+  const each = (code) => [0, 1, 2, 3].map((k) => code.replaceAll("#", k).replaceAll("@", k * width)).join("\n");
   return `${HEAD}
 uniform sampler2D table;
-${ownPart(plan)}
-out vec4 kept;
+uniform isampler2DArray latents;
+uniform vec4 own[${GROUP * width}];
+${each("layout(location = #) out vec4 kept#;")}
 void main() {
-  ivec2 here = ivec2(gl_FragCoord.xy);
-  int i = here.y * ${PER_ROW(plan.groups)} + here.x / ${plan.groups};
-  if (here.x >= ${PER_ROW(plan.groups) * plan.groups} || i >= ${count}) discard;
+  int i = int(gl_FragCoord.y) * ${WIDTH} + int(gl_FragCoord.x);
   ivec2 at = ${texel(TABLE_TEXELS)};
-  float opacity = 1.0 / (1.0 + exp(-texelFetch(table, at, 0).w));
-  kept = ownPart(i, here.x % ${plan.groups}, texelFetch(table, at + ivec2(3, 0), 0), opacity);
+  vec4 color = texelFetch(table, at + ivec2(3, 0), 0);
+  color.a = 1.0 / (1.0 + exp(-texelFetch(table, at, 0).w));
+${each("  vec4 h# = own[@] + mat4(own[@ + 1], own[@ + 2], own[@ + 3], own[@ + 4]) * color;")}
+  vec4 z;
+${Array.from({ length: plan.latentTexels }, (_, l) => `  z = vec4(texelFetch(latents, ivec3(${texel(1)}, ${l}), 0));
+${each(`  h# += mat4(own[@ + ${5 + 4 * l}], own[@ + ${6 + 4 * l}], own[@ + ${7 + 4 * l}], own[@ + ${8 + 4 * l}]) * z;`)}`).join("\n")}
+${each("  kept# = h#;")}
 }
 `;
 }
@@ -139,7 +148,7 @@ function lookShader(plan, header, count, kept) {
     const code = `
     for (int j = 0; j < ${groups}; j++) {
       int o = ${offset} + ${size} * j;
-      vec4 h = ${kept ? `texelFetch(kept, at + ivec2(${first} + j, 0), 0)` : `ownPart(i, ${first} + j, color, base.a)`};
+      vec4 h = ${kept ? `texelFetch(kept, ivec3(at, ${first} + j), 0)` : `ownPart(i, ${first} + j, color, base.a)`};
 ${view.map((input, k) => `      h += w[o + ${k}] * ${input};`).join("\n")}
       h = max(h, 0.0);
       ${result} += mat4(w[o + ${view.length}], w[o + ${view.length + 1}], w[o + ${view.length + 2}], w[o + ${view.length + 3}]) * h;
@@ -161,7 +170,7 @@ ${view.map((input, k) => `      h += w[o + ${k}] * ${input};`).join("\n")}
   };
   return `${HEAD}
 uniform sampler2D table;
-${kept ? "uniform sampler2D kept;" : ownPart(plan)}
+${kept ? "uniform sampler2DArray kept;" : ownPart(plan)}
 layout(std140) uniform Weights { vec4 w[${size}]; };
 uniform vec3 center;
 uniform float gain;
@@ -191,7 +200,7 @@ void main() {
     vec3 d = v / r;
     float far = log(r / ${number(header.head.scene_unit)});
 ${waves}    vec4 low = w[${sum}], high = ${high ? `w[${sum + 1}]` : "vec4(0.0)"};
-${kept ? `    ivec2 at = ${texel(plan.groups)};` : ""}${branch(low, "low")}${high ? branch(high, "high") : ""}
+${kept ? `    ivec2 at = ${texel(1)};` : ""}${branch(low, "low")}${high ? branch(high, "high") : ""}
     vec3 turned = low.rgb${high ? " + high.rgb / (1.0 + exp(-high.a))" : ""};
     residual.rgb = ${number(config.color_scale)} * tanh(clamp(turned, -15.0, 15.0));
     seen.rgb = max(color.rgb + residual.rgb, 0.0);

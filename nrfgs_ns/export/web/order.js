@@ -23,30 +23,37 @@ function planesOf({ view, lens: [fx, fy, cx, cy], size: [width, height] }, near)
 }
 
 class Order {
-  // Takes the table [N, 16] of `readScene`.
-  constructor(table) {
-    const n = (this.count = table.length / 16);
+  // n splats. spare: buffers of 8 n bytes or more, for sorting, if there are any.
+  constructor(n, spare) {
+    Object.assign(this, { count: n, spare, keys: null });
     this.means = new Float32Array(3 * n);
     this.reach = new Float32Array(n);  // radius of a ball outside which a splat is not drawn
-    for (let i = 0; i < n; i++) {
-      for (let a = 0; a < 3; a++) this.means[3 * i + a] = table[16 * i + a];
-      this.reach[i] = SIGMAS * Math.max(table[16 * i + 8], table[16 * i + 9], table[16 * i + 10]);
-    }
     // For rays, in bytes: the quaternion (w, x, y, z), scales as shares of the largest, and the opacity.
     this.shapes = new Uint8Array(8 * n);
-    for (let i = 0; i < n; i++) {
-      const at = 16 * i, largest = this.reach[i] / SIGMAS;
-      for (let k = 0; k < 4; k++) this.shapes[8 * i + k] = Math.round(128 + 127 * table[at + 4 + k]);
-      for (let k = 0; k < 3; k++) this.shapes[8 * i + 4 + k] = Math.max(1, Math.round((255 * table[at + 8 + k]) / largest));
-      this.shapes[8 * i + 7] = Math.round(255 / (1 + Math.exp(-table[at + 3])));
+  }
+
+  // Takes rows of the table of `readScene`, from splat `first` on.
+  add(first, table) {
+    const { means, reach, shapes } = this;
+    for (let i = first, at = 0; at < table.length && i < this.count; i++, at += 16) {
+      const largest = Math.max(table[at + 8], table[at + 9], table[at + 10]);
+      for (let a = 0; a < 3; a++) means[3 * i + a] = table[at + a];
+      reach[i] = SIGMAS * largest;
+      for (let k = 0; k < 4; k++) shapes[8 * i + k] = Math.round(128 + 127 * table[at + 4 + k]);
+      for (let k = 0; k < 3; k++) shapes[8 * i + 4 + k] = Math.max(1, Math.round((255 * table[at + 8 + k]) / largest));
+      shapes[8 * i + 7] = Math.round(255 / (1 + Math.exp(-table[at + 3])));
     }
-    this.keys = [new Uint32Array(n), new Uint32Array(n)];
-    this.rows = [new Uint32Array(n), new Uint32Array(n)];
-    this.depths = new Float32Array(this.keys[0].buffer);
   }
 
   // Rows of the table, far to near; of equally deep splats the later first: gsplat draws the earlier in front.
   sorted({ view, lens, size, near }) {
+    if (!this.keys) {
+      [this.keys, this.rows] = [0, 1].map(() => {
+        const n = this.count, buffer = this.spare.pop() ?? new ArrayBuffer(8 * n);
+        return [new Uint32Array(buffer, 0, n), new Uint32Array(buffer, 4 * n, n)];
+      });
+      this.depths = new Float32Array(this.keys[0].buffer);
+    }
     const { means, reach, depths } = this;
     const planes = planesOf({ view, lens, size }, near);
     let m = 0;
@@ -119,15 +126,29 @@ class Order {
   }
 }
 
-// What the worker answers: {read} with a file's bytes, then any number of {camera} and {pick}.
+const MOST_SENT = 2;  // parts of a scene that are on their way to the painter
+
+// What the worker answers: {read} with a file's bytes, answered by all that `readScene` yields and {read}, and with a
+// buffer that comes back as {spent}; then any number of {camera} and {pick}.
 function answer(post) {
-  let order = null;
-  return ({ read, camera, pick }) => {
+  let order = null, reading = null, sent = 0;
+  const spare = [];
+  const go = () => {
+    while (reading && sent < MOST_SENT) {
+      const { value: part = { read: true } } = reading.next(), [, values] = part.table ?? part.latents ?? [];
+      if (part.scene) order = new Order(part.scene.count, spare);
+      if (part.table) order.add(...part.table);
+      if (part.read) reading = null;
+      if (values) sent++;
+      post(part, values ? [values.buffer] : []);
+    }
+  };
+  return ({ read, spent, camera, pick }) => {
     try {
-      if (read) {
-        const scene = readScene(new Uint8Array(read), (progress) => post({ progress }));
-        order = new Order(scene.table);
-        post({ scene }, [scene.table.buffer, scene.latents.buffer]);
+      if (read || spent) {
+        if (read) reading = readScene(read, spare);
+        else [sent] = [sent - 1, spare.push(spent)];
+        go();
       } else if (pick) {
         post({ picked: order.along(pick) });
       } else {
@@ -136,6 +157,7 @@ function answer(post) {
         post({ sorted: { rows, seconds, along: order.along(camera) } }, [rows.buffer]);
       }
     } catch (error) {
+      reading = null;
       if (!(error instanceof BadFile)) console.error(error);
       post({ failed: error instanceof BadFile ? error.message : UNREADABLE });
     }
