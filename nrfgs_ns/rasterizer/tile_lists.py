@@ -290,7 +290,7 @@ def tile_lists(
     """Lists of one camera's tiles. All tensors are contiguous.
 
     Args:
-        means2d, depths, conics: a `Projection`'s, M >= 1 rows.
+        means2d, depths, conics: a `Projection`'s, M >= 1 rows; if split, fewer than 2^28.
         radii: half the sides, in pixels, of the boxes that bound the splats: of squares [M] or of rectangles [M, 2].
         opacities: as composited, compensation included, [M].
         width, height: image size in tiles; with the row below, at most 2^16 that are not split.

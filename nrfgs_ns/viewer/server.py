@@ -113,7 +113,7 @@ def _update_without_exceptions(update_scene: Callable[..., None], viewer: Viewer
 
 
 def _complete_without_pause(training_complete: Callable[..., None], viewer: Viewer) -> None:
-    """Say that the training is complete, which leaves a button that pauses nothing."""
+    """Complete the training, and hide the button, which would pause nothing."""
     training_complete(viewer)
     _hide_pause(viewer)
 
