@@ -74,7 +74,7 @@ def axes(box: tuple[float, float, float], ticks: dict[float, str], values: list[
     and the parts."""
     step = next(step for step in (0.01, 0.02, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0) if max(values) - min(values) < 7 * step)
     low, high = math.floor(min(values) / step + 1e-6) * step, math.ceil(max(values) / step - 1e-6) * step
-    (left, top, right), least, most = box, min(ticks) / 1.1, max(ticks) * 1.1
+    (left, top, right), least, most = box, min(ticks) / 1.3, max(ticks) * 1.1
 
     def at(x: float, y: float) -> tuple[float, float]:
         across = math.log(x / least) / math.log(most / least)
@@ -106,21 +106,24 @@ def with_legend(parts: list[str], labels: Iterable[str], top: float) -> str:
     return svg(y + 12, parts)
 
 
-def curves(labels: Labels, metrics: tuple[str, ...] = ("psnr",)) -> str:
-    """Metrics over numbers of splats on three captures: a panel each, a line for each label's run and rule."""
-    parts = []
-    for (y, metric), (x, scene) in product(enumerate(metrics), enumerate(CURVES)):
+def curves(
+    labels: Labels, metrics: tuple[str, ...] = ("psnr",), scenes: tuple[str, ...] = CURVES, columns: int = 3
+) -> str:
+    """Metrics over numbers of splats on captures: a panel each, a line for each label's run and rule."""
+    parts, wide = [], 3 * PANEL // columns
+    for index, (metric, scene) in enumerate(product(metrics, scenes)):
+        x, y = index % columns, index // columns
         lines = [
             [(one["splats"], one[metric]) for count in COUNTS for one in equal(scene, run, count, rule)]
             for run, rule in labels.values()
         ]
-        box = PANEL * x + SIDE, (HIGH + 62) * y + 28, PANEL * (x + 1)
+        box = wide * x + SIDE, (HIGH + 62) * y + 28, wide * (x + 1)
         ticks, title = {count: f"{count // 1000}k" for count in COUNTS}, "dB" if metric == "psnr" else "SSIM"
         at, drawn = axes(box, ticks, [value for points in lines for _, value in points], f"{scene}, {title}")
         for colour, points in zip(LINES, lines, strict=False):
             drawn += line([at(*point) for point in points], colour)
         parts += drawn
-    return with_legend(parts, labels, (HIGH + 62) * len(metrics) + 12)
+    return with_legend(parts, labels, (HIGH + 62) * (y + 1) + 12)
 
 
 def seconds() -> str:
@@ -181,7 +184,7 @@ FIGURES = {
     "files.svg": files,
     "fitted.svg": fitted,
     "heads.svg": partial(curves, HEADS_OF),
-    "rules.svg": partial(curves, RULES_OF, ("psnr", "ssim")),
+    "rules.svg": partial(curves, RULES_OF, ("psnr", "ssim"), (*CURVES, "castle"), columns=2),
     "seats.svg": partial(curves, SEATS_OF),
 }
 

@@ -22,9 +22,8 @@ def scale_cells(column: str) -> dict[tuple[int, float], dict[str, list[float]]]:
 
 
 def scale_ratios() -> str:
-    """Least and most that a step of `nrfgs` has of another renderer's time, with up to a million splats: more were
-    measured with other kernels."""
-    cells, parts = [cell for (count, _), cell in scale_cells("step_ms").items() if count <= 1e6], []
+    """Least and most that a step of `nrfgs` has of another renderer's time."""
+    cells, parts = scale_cells("step_ms").values(), []
     words = {"splatfacto": "splatfacto's time,", "nrfgs-sh": "`nrfgs-sh`'s and", "faster-gs": "Faster-GS's"}
     for other, named in words.items():
         ratios = [median(one["nrfgs"]) / median(one[other]) for one in cells]
@@ -32,12 +31,18 @@ def scale_ratios() -> str:
     return " ".join(parts)
 
 
-def scale_fit(column: str, factor: str, unit: str, renderer: str, most: str = "inf") -> str:
-    """Least squares of a quantity by splats and pixels, with at most as many millions of splats."""
-    places = {place: cells[renderer] for place, cells in scale_cells(column).items() if place[0] <= 1e6 * float(most)}
-    cells = {place: float(factor) * median(values) for place, values in places.items()}
+def scale_fit(column: str, factor: str, unit: str, renderer: str) -> str:
+    """Least squares of a quantity by splats and pixels."""
+    places = scale_cells(column).items()
+    cells = {place: float(factor) * median(cell[renderer]) for place, cell in places}
     parts = np.linalg.lstsq([[1, count / 1e6, pixels] for count, pixels in cells], [*cells.values()], rcond=None)[0]
     return f"{parts[0]:.1f} {unit}, {parts[1]:.1f} for each million splats and {parts[2]:.2f} for each megapixel"
 
 
-BLOCKS = {"speed.scale_fit": scale_fit, "speed.scale_ratios": scale_ratios}
+def lists() -> str:
+    """Least and most that lists split into small tiles have of large tiles' time at 8 megapixels."""
+    sizes = [one for name, one in records("tests")["lists"].items() if name.endswith("/3464 x 2309")]
+    return span([one["split"]["all"] / one["direct"]["all"] for one in sizes], "{:.2f}".format)
+
+
+BLOCKS = {"speed.scale_fit": scale_fit, "speed.scale_ratios": scale_ratios, "speed.lists": lists}
