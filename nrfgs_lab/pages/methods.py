@@ -149,17 +149,20 @@ def first_rule() -> str:
 SEATS = {"field": "nrfgs", "harmonics": "nrfgs-sh", "network at the pixel": "nrfgs-deferred"}
 SEATS |= {"convolutions at the pixel": "nrfgs-latent-spec", "field and network at the pixel": ""}
 """Run -> its method in a record of costs, if it has one."""
+ANEW = {"network at the pixel", "field and network at the pixel"}
+"""Runs of the plan `test-views` of pixel.yaml, with chosen rates."""
 
 
-def seated(scene: str, run: str) -> Trainings:
-    """A run of the plan `test-views` of pixel.yaml."""
-    return trainings("rates", scene, run.replace(" ", "_"), f"{BY_ERROR}@{COUNTS[1]}")
+def seated(scene: str, run: str, beside: str) -> Trainings:
+    """A run, with 150,000 splats: one of `numbers`, or, where it or what is set beside it is in `ANEW`, of `rates`."""
+    study = "rates" if ANEW & {run, beside} else "numbers"
+    return trainings(study, scene, run.replace(" ", "_"), f"{BY_ERROR}@{COUNTS[1]}")
 
 
 def over(other: str, run: str = "field") -> str:
     """Verdicts on a run and another head with 150,000 splats."""
-    gains = {scene: view_gains(seated(scene, run), seated(scene, other)) for scene in (*CURVES, "castle")}
-    return "; ".join(f"`{scene}` {verdict(views)}: {ahead(views)}" for scene, views in gains.items() if views)
+    gains = {scene: view_gains(seated(scene, run, other), seated(scene, other, run)) for scene in CURVES}
+    return "; ".join(f"`{scene}` {verdict(views)}: {ahead(views)}" for scene, views in gains.items())
 
 
 def rates(head: str) -> str:
@@ -180,7 +183,8 @@ def seats() -> str:
     """Quality, cost and stillness of networks at the splat and at the pixel."""
     costs, body = records("numbers"), []
     for run, method in SEATS.items():
-        row = [run, *(cell(seated(scene, run)) for scene in (*CURVES, "castle"))]
+        beside = "" if run.startswith("convolutions") else "network at the pixel"
+        row = [run, *(cell(seated(scene, run, beside)) for scene in (*CURVES, "castle"))]
         if method:
             turns, large = [costs[f"cost/{method}/0.4/{turn}"] for turn in (0, 1)], costs[f"cost/{method}/2.0/0"]
             small = {name: fmean(one[name] for one in turns) for name in ("step_ms", "1080p", "4K")}
