@@ -169,9 +169,10 @@ def composite_view(
     background: Tensor,
     *,
     with_depth: bool = True,
+    absgrad: bool = False,
+    assume_finite: bool = False,
     image_of: Callable[[Tensor, Tensor], Tensor] | None = None,
     look: Callable[[Tensor], Tensor] | None = None,
-    **options: bool,
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Composite the visible splats over a background.
 
@@ -180,17 +181,24 @@ def composite_view(
         appearance: their colours and opacities.
         background: a colour [3].
         with_depth: return depth, too.
+        absgrad, assume_finite: as in `rasterizer.composite`.
         image_of: of a head at the pixel (`AppearanceHead`). Features are composited over zero, and their image is drawn
             over the background, as opaque as the splats are. None: colours are the image's.
         look: the photograph's exposure model, applied to the rendered image [H, W, 3]; None: clamp it to [0, 1].
-        options: of `rasterizer.composite`: absgrad, assume_finite.
 
     Returns:
         "rgb" [H, W, 3] in [0, 1], "accumulation" [H, W, 1], "background" [H, W, 3], and "depth" [H, W, 1] if wanted;
         and the rasterizer's `info`, for densification.
     """
-    behind = background[None] if image_of is None else None
-    render, alpha, info = composite(view.projection, *appearance, backgrounds=behind, with_depth=with_depth, **options)
+    render, alpha, info = composite(
+        view.projection,
+        appearance.colors,
+        appearance.opacities,
+        backgrounds=background[None] if image_of is None else None,
+        with_depth=with_depth,
+        absgrad=absgrad,
+        assume_finite=assume_finite,
+    )
     render, alpha = render.squeeze(0), alpha.squeeze(0)  # the gradient of [0] would be a copy among zeros
     rgb = render[..., :-1] if with_depth else render
     if image_of is not None:
