@@ -41,7 +41,7 @@ def take_kernel(
         other = held + 1.0
         if not SUMS:
             other = tl.load(change + at, mask=valid, other=0.0)
-        tl.store(others + row, tl.maximum(held, other), mask=valid)
+        tl.store(others + row, tl.where(other > held, other, held), mask=valid)  # NaN is no more than what is held
 
 
 launch = Launcher(take_kernel)
