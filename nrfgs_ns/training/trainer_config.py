@@ -171,15 +171,18 @@ def _absolute(path: Path | None) -> Path | None:
 
 def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool) -> None:
     """Say what was chosen automatically."""
-    model = pipeline.model
+    model, data = pipeline.model, pipeline.datamanager.train_dataset
     views, given = model.num_views, model.num_train_data
     parts = [f"{steps_for(views):,} steps"] if steps_are_chosen else []
     parts += [f"view dependence reduced to {model.trust:.2g}, as suits few views"] if model.trust < FEW else []
+    added = 0 if model.seed_points is None else len(model.seed_points[0]) - len(data.metadata["points3D_xyz"])
+    parts += [f"{added:,} points from the photographs"] if added > 0 else []
+    near = model.projection_options.near_plane
+    parts += [f"nothing drawn nearer than {near:.2g}"] if near == model.near else []
     words = f"{given} training view{'s' * (given != 1)}"
     count = words if views == given else f"{views} different training views of {given}"
     if parts:
         CONSOLE.print(f"{count}: {', '.join(parts)} (docs/captures.md).", soft_wrap=True)
-    data = pipeline.datamanager.train_dataset
     width, height = (int(side.max()) for side in (data.cameras.width, data.cameras.height))
     if (factor := data.metadata.get("factor", 1)) > 1 or max(width, height) > MAX_AUTO_RESOLUTION:
         size = f"1/{factor} of their size" if factor > 1 else "full size"
