@@ -178,7 +178,7 @@ def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool)
     added = 0 if model.seed_points is None else len(model.seed_points[0]) - len(data.metadata["points3D_xyz"])
     parts += [f"{added:,} points from the photographs"] if added > 0 else []
     near = model.projection_options.near_plane
-    parts += [f"nothing drawn nearer than {near:.2g}"] if near == model.near else []
+    parts += [f"nothing drawn nearer than {near / model.scene_unit:.2g} scene units"] if near == model.near else []
     words = f"{given} training view{'s' * (given != 1)}"
     count = words if views == given else f"{views} different training views of {given}"
     if parts:
