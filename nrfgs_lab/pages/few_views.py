@@ -18,6 +18,8 @@ SPARSE = {"24_views_bonsai": (24, "22.60"), "kitchen": (21, "19.24 (other views)
 implementations (arXiv 2508.04968)."""
 HALF = {f"{views}_views_bonsai": views for views in (16, 24, 32, 64, 128)} | {"bonsai": 255}
 """Half-size scenes there -> training views."""
+MADE = {"glossy": "made", "matt": "made_matt"}
+"""Kind of a made capture -> its scene there; each has 262 training views."""
 
 
 def runs_of(scene: str, name: str) -> Trainings:
@@ -128,14 +130,21 @@ def sparse_runs(scene: str) -> list[Trainings]:
 
 
 def sparse() -> str:
-    """The protocol of 24 views: the field, harmonics, the verdict, and 3DGS's published PSNR."""
+    """The protocol of 24 views: the field, harmonics, the verdict, splatfacto, and 3DGS's published PSNR."""
     body = []
     for scene, (views, published) in SPARSE.items():
-        runs = sparse_runs(scene)
+        runs, host = sparse_runs(scene), trainings("twenty-four", scene, HOST, OWN)
         gains = view_gains(*runs)
         label = f"{scene.rpartition('_')[2]}, {views}"
-        body.append([label, *map(cell, runs), f"{verdict(gains)}: {ahead(gains)}", published])
-    return grid(["training views", "`nrfgs`", "harmonics", "`nrfgs` against harmonics", "3DGS, published"], body)
+        body.append([label, *map(cell, runs), f"{verdict(gains)}: {ahead(gains)}", cell(host), published])
+    head = "`nrfgs`", "harmonics", "`nrfgs` against harmonics", HOST, "3DGS, published"
+    return grid(["training views", *head], body)
+
+
+def made() -> str:
+    """The verdict against harmonics on two made captures that differ in gloss."""
+    gains = {label: view_gains(*sparse_runs(scene)) for label, scene in MADE.items()}
+    return "; ".join(f"{label} {verdict(of)}: {ahead(of)}" for label, of in gains.items())
 
 
 def by_views() -> str:
@@ -165,6 +174,7 @@ BLOCKS = {
     "captures.today": lambda *place: _run({of: mean(today(*place), of) for of in ("psnr", "ssim", "splats")}),
     "captures.sparse": sparse,
     "captures.by_views": by_views,
+    "captures.made": made,
     "captures.alone": lambda name: f"{alone(name)['seconds']:.0f} s",
     "readme.pictured": pictured,
     "captures.run": lambda name: _run(records("trials")[name]),

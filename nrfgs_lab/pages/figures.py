@@ -10,7 +10,7 @@ from functools import partial
 from itertools import product
 from statistics import median
 
-from nrfgs_lab.pages.few_views import FIELD, HALF, SAME, sparse_runs, today
+from nrfgs_lab.pages.few_views import FIELD, HALF, MADE, SAME, sparse_runs, today
 from nrfgs_lab.pages.files import CAPTURES, reports
 from nrfgs_lab.pages.methods import COUNTS, CURVES, HEADS_OF, RULES_OF, SEATS_OF, Labels, equal
 from nrfgs_lab.pages.runs import ROOT, VIEWS, bench_rows, mean_of, records, view_gains
@@ -32,6 +32,7 @@ def views() -> str:
     """Gain of the field over harmonics with the same rules in each test view, a dot each; bars are medians."""
     rows = {(views, scene): (today(scene, FIELD), today(scene, SAME)) for scene, views in VIEWS.items()}
     rows |= {(views, "bonsai"): sparse_runs(scene) for scene, views in HALF.items() if scene != "bonsai"}
+    rows |= {(262, kind): sparse_runs(scene) for kind, scene in MADE.items()}
     gains = {f"{scene}, {views}": view_gains(*rows[views, scene]) for views, scene in sorted(rows, reverse=True)}
     least, most = (math.floor(min(map(min, gains.values()))), math.ceil(max(map(max, gains.values()))))
     height = ROW * len(gains) + 50
