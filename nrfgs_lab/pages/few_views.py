@@ -2,7 +2,7 @@
 """Blocks of README.md, docs/captures.md and docs/tables.md: captures' test views, and trials on held-out views."""
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from statistics import fmean, median
 
 from scipy.stats import binomtest
@@ -141,16 +141,10 @@ def sparse() -> str:
     return grid(["training views", *head], body)
 
 
-def made() -> str:
-    """The verdict against harmonics on two made captures that differ in gloss."""
-    gains = {label: view_gains(*sparse_runs(scene)) for label, scene in MADE.items()}
+def verdicts(pairs: Mapping[str, Sequence[Trainings]]) -> str:
+    """Verdicts on pairs of trainings, by label."""
+    gains = {label: view_gains(*pair) for label, pair in pairs.items() if all(pair)}
     return "; ".join(f"{label} {verdict(of)}: {ahead(of)}" for label, of in gains.items())
-
-
-def by_views() -> str:
-    """The verdict against harmonics with more and more of `bonsai`'s views."""
-    gains = {views: view_gains(*sparse_runs(scene)) for scene, views in HALF.items()}
-    return "; ".join(f"{views} views {verdict(of)}: {ahead(of)}" for views, of in gains.items())
 
 
 def alone(name: str) -> dict:
@@ -173,8 +167,8 @@ BLOCKS = {
     "captures.floaters": floaters,
     "captures.today": lambda *place: _run({of: mean(today(*place), of) for of in ("psnr", "ssim", "splats")}),
     "captures.sparse": sparse,
-    "captures.by_views": by_views,
-    "captures.made": made,
+    "captures.by_views": lambda: verdicts({f"{views} views": sparse_runs(scene) for scene, views in HALF.items()}),
+    "captures.made": lambda: verdicts({kind: sparse_runs(scene) for kind, scene in MADE.items()}),
     "captures.alone": lambda name: f"{alone(name)['seconds']:.0f} s",
     "readme.pictured": pictured,
     "captures.run": lambda name: _run(records("trials")[name]),

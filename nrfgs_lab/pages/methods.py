@@ -4,7 +4,7 @@
 from collections import defaultdict
 from statistics import fmean, median
 
-from nrfgs_lab.pages.few_views import ahead, cell, verdict
+from nrfgs_lab.pages.few_views import cell, verdict, verdicts
 from nrfgs_lab.pages.runs import (
     ORIGINAL,
     VIEWS,
@@ -146,25 +146,14 @@ def first_rule() -> str:
     return f"better in {', '.join(found)}; its SSIM is higher in {sum(higher)} of {len(higher)}"
 
 
-SEATS = {"field": "nrfgs", "harmonics": "nrfgs-sh", "network at the pixel": "nrfgs-deferred"}
-SEATS |= {"convolutions at the pixel": "nrfgs-latent-spec"}
-"""Run of the plan `test-views` of pixel.yaml -> its method in a record of costs."""
-SCENES_OF_SEATS = "bonsai", "goldcape", "caliterra", "fox"
-"""Captures with enough test views for a verdict."""
-STILL = "bonsai", "caliterra", "castle"
-"""Captures with records of flicker."""
-
-
 def seated(scene: str, run: str) -> Trainings:
     """A run with 150,000 splats, and with the rates that were chosen for its head."""
     return trainings("rates", scene, run.replace(" ", "_"), f"{BY_ERROR}@{COUNTS[1]}")
 
 
 def over(other: str, run: str = "field") -> str:
-    """Verdicts on a run and another head with 150,000 splats."""
-    pairs = {scene: (seated(scene, run), seated(scene, other)) for scene in SCENES_OF_SEATS}
-    gains = {scene: view_gains(*pair) for scene, pair in pairs.items() if all(pair)}
-    return "; ".join(f"`{scene}` {verdict(views)}: {ahead(views)}" for scene, views in gains.items())
+    """Verdicts on a run and another head with 150,000 splats, on captures with enough test views."""
+    return verdicts({f"`{scene}`": [seated(scene, name) for name in (run, other)] for scene in list(VIEWS)[:4]})
 
 
 def rates(head: str) -> str:
@@ -182,27 +171,13 @@ def rates(head: str) -> str:
 
 
 def seats() -> str:
-    """Quality of networks at the splat and at the pixel: PSNR/SSIM of each capture, and mean MS-SSIM and FLIP."""
+    """Networks at the splat and at the pixel: PSNR/SSIM of each capture, and mean MS-SSIM and FLIP."""
     body = []
-    for run in SEATS:
+    for run in SEATS_OF:
         runs = [seated(scene, run) for scene in VIEWS]
         means = [f"{fmean(mean(of, metric) for of in runs):.3f}" for metric in ("ms_ssim", "flip")]
         body.append([run, *map(cell, runs), "/".join(means)])
     return grid(["", *VIEWS, "MS-SSIM/FLIP"], body)
-
-
-def seat_costs() -> str:
-    """Cost and stillness of networks at the splat and at the pixel."""
-    costs, body = records("numbers"), []
-    for run, method in SEATS.items():
-        small, large = ([costs[f"cost/{method}/{size}/{turn}"] for turn in (0, 1)] for size in ("0.4", "2.0"))
-        still = [costs[f"flicker/{run}/{scene}"] for scene in STILL]
-        steps = "/".join(f"{fmean(one['step_ms'] for one in turns):.1f}" for turns in (small, large))
-        frames = "/".join(f"{fmean(one[size] for one in small):.0f}" for size in ("1080p", "4K"))
-        flickers = "/".join(f"{one['flicker']:.2f}" for one in still)
-        body.append([run, steps, f"{large[0]['peak_mb'] / 1000:.1f}", frames, flickers, f"{still[0]['psnr']['2']:.1f}"])
-    cost = "ms of a step, 0.4/2 MP", "GB at 2 MP", "frames a second, 1080p/4K"
-    return grid(["", *cost, f"flicker, {'/'.join(STILL)}", "twice the size, dB"], body)
 
 
 # The choice of the heads' settings.
@@ -263,6 +238,6 @@ def noise() -> str:
 
 BLOCKS = {
     **{f"comparison.{block.__name__}": block for block in (every, parts, over_gsnb, chosen)},
-    **{f"equal.{block.__name__}": block for block in (at_equal_numbers, over, rates, first_rule, seats, seat_costs)},
+    **{f"equal.{block.__name__}": block for block in (at_equal_numbers, over, rates, first_rule, seats)},
     **{f"deviations.{block.__name__}": block for block in (worth, noise)},
 }
