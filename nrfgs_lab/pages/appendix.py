@@ -17,7 +17,7 @@ RIVALS = {
 """Label -> trainings in results/captures.json."""
 GAPS = {
     "**twice the residual, on the logit**: `nrfgs`": "twice on the logit",
-    "harmonics, same rules": "harmonics",
+    "harmonics without noise": "harmonics",
 }
 """Label -> trial with gaps in results/trials.json; its default added the residual to the opacity."""
 

@@ -125,7 +125,7 @@ def _run(one: Mapping) -> str:
 
 
 def sparse_runs(scene: str) -> list[Trainings]:
-    """The protocol of 24 views: the field's trainings and those of harmonics with its rules."""
+    """The field's trainings of a scene in results/twenty-four.json, and those of harmonics with its rules."""
     return [trainings("twenty-four", scene, name, OWN) for name in (FIELD, "harmonics__same_rules")]
 
 
@@ -148,7 +148,7 @@ def verdicts(pairs: Mapping[str, Sequence[Trainings]]) -> str:
 
 
 def alone(name: str) -> dict:
-    """A training of `bonsai` alone on a GPU: on `one host`, or on `another host`."""
+    """A training of `bonsai` alone on a GPU: on `one host`, a `busy host` or `another host`."""
     return records("trials")[f"{name}/bonsai-42"]
 
 
