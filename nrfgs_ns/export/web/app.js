@@ -11,13 +11,12 @@ function fail(error) {
   if (!told) console.error(error);
   const hint = error instanceof BadFile ? " Load the page again, or ask for it again where it came from." : "";
   byId("loading").hidden = true;
-  byId("failed").hidden = false;
-  byId("failed").textContent = message + hint;
+  Object.assign(byId("failed"), { hidden: false, textContent: message + hint });
   refuse(error);
   emit("failed", { message });
 }
-window.addEventListener("error", (event) => fail(event.error ?? event.message));
-window.addEventListener("unhandledrejection", (event) => fail(event.reason));
+addEventListener("error", (event) => fail(event.error ?? event.message));
+addEventListener("unhandledrejection", (event) => fail(event.reason));
 
 let begin, refuse;
 const ready = new Promise((resolve, reject) => ([begin, refuse] = [resolve, reject]));
@@ -289,7 +288,7 @@ function finished() {
 // What the canvas shows, as the address of a PNG.
 function picture() {
   paint(1);
-  return canvas.toDataURL("image/png");
+  return canvas.toDataURL();
 }
 
 // Slow frames: first the field is spread over several, then pictures get smaller. Fast ones: the other way round.

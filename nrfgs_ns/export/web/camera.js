@@ -39,7 +39,7 @@ function lensOn([fx, fy, cx, cy, w], width, height) {
   return [s * fx, s * fy, s * cx + (width - s * w) / 2, s * cy + (height - s) / 2];
 }
 
-// A unit quaternion (w, x, y, z) of axes, and back.
+// A unit quaternion (w, x, y, z) of axes; axesOf is the way back.
 function quaternionOf([x, y, z]) {
   const a = z[1] - y[2], b = x[2] - z[0], c = y[0] - x[1], d = x[1] + y[0], e = x[2] + z[0], f = y[2] + z[1];
   const rows = [  // the quaternion times each of its numbers: the largest is exact
@@ -47,14 +47,6 @@ function quaternionOf([x, y, z]) {
     [b, d, 1 - x[0] + y[1] - z[2], f], [c, e, f, 1 - x[0] - y[1] + z[2]],
   ];
   return unit(rows.reduce((best, row, k) => (row[k] > best[0] ? [row[k], row] : best), [-1])[1]);
-}
-
-function axesOf([w, x, y, z]) {
-  return [
-    [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-    [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-    [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-  ];
 }
 
 const STEPS = 24;  // of a stretch between two cameras, by which its length is measured

@@ -3,7 +3,7 @@
 
 const MAGIC = [0x89, 0x4e, 0x52, 0x46, 0x0d, 0x0a, 0x1a, 0x0a];
 const VERSION = 3;
-const BYTES = { uint8: 1, uint16: 2, uint32: 4, uint64: 8, float16: 2, float32: 4, int16: 2, int32: 4 };
+const bytesOf = (dtype) => dtype.match(/\d+/) / 8;
 const CODINGS = new Map([
   ["xz", ["uint8", "uint16", "uint32", "uint64", "float16", "float32"]], ["rans", ["int16", "int32", "uint32"]],
 ]);
@@ -14,6 +14,7 @@ const WIDTHS = { means: 3, opacities: 1, scales: 3, colors: 3, turns: 3 };  // n
 const SH_C0 = 0.28209479177387814, { imul } = Math;
 const ARRAYS = { int16: Int16Array, int32: Int32Array, uint32: Uint32Array };
 const WIDTH = 4096;  // texels of a texture's row
+const PART = 2 ** 14;  // splats of the table at a time: whole rows
 
 // The field's options, and what is assumed of one that a file leaves out.
 const OPTIONS = {
@@ -81,11 +82,11 @@ function checkHeader(header) {
     expect(right && whole, `its field's ${name} is out of range`);
   }
   expect(isNumber(head.scene_unit, 1 / LARGEST, LARGEST), "its unit of length is out of range");
-  expect(hasKeys(render, ["rasterize_mode", "background"], ["near_plane"]), "it does not say how it is drawn");
-  expect(["classic", "antialiased"].includes(render.rasterize_mode), "it does not say how it is drawn");
+  const drawn = hasKeys(render, ["rasterize_mode", "background"], ["near_plane"]) && ["classic", "antialiased"].includes(render.rasterize_mode);
+  expect(drawn, "it does not say how it is drawn");
   const { background } = render;
-  expect(Array.isArray(background) && background.length === 3, "its background is no colour");
-  expect(background.every((value) => isNumber(value, 0, 1)), "its background is no colour");
+  const color = Array.isArray(background) && background.length === 3 && background.every((value) => isNumber(value, 0, 1));
+  expect(color, "its background is no colour");
   if ("near_plane" in render) expect(isNumber(render.near_plane, 0, LARGEST), "its near plane is out of range");
   render.near_plane ||= 0.01 * head.scene_unit;
   const widths = { ...WIDTHS, latents: head.config.latent_dim };
@@ -118,8 +119,11 @@ function shapesOf(config) {
   return shapes;
 }
 
-// Gives arrays' memory back at once, where a browser can.
-const free = (arrays) => arrays.forEach(({ buffer }) => buffer.transfer?.(0));
+// Gives arrays' memory back at once: it is sent to nobody. With `transfer(0)` what came in a message would stay until
+// the browser looks for garbage.
+const { port1: nowhere, port2 } = new MessageChannel();
+port2.close();
+const free = (arrays) => nowhere.postMessage(0, arrays.map(({ buffer }) => buffer));
 
 function* sceneOf(header, streams, spare) {
   const count = header.splats, { config } = header.head, rank = config.latent_dim, weights = {};
@@ -139,31 +143,32 @@ function* sceneOf(header, streams, spare) {
   }
   yield { scene: { header, count, weights } };
   const latents = streams.get("latents"), Codes = ARRAYS[latents.dtype];
-  const rows = Math.ceil(count / WIDTH), part = 1024 * Math.ceil(rows / 2);
-  const size = 4 * WIDTH * rows * Codes.BYTES_PER_ELEMENT;  // bytes of a layer, and of `part` splats' rows or more
-  const buffer = () => spare.pop() ?? new ArrayBuffer(Math.max(size, 64 * part));
-  const columns = [];
+  const size = 4 * WIDTH * Math.ceil(count / WIDTH);  // numbers of a layer
+  const buffer = () => spare.pop() ?? new ArrayBuffer(Math.max(size * Codes.BYTES_PER_ELEMENT, 64 * PART));
+  const parts = Array.from({ length: Math.ceil(count / PART) }, () => []);  // their columns
+  let done = 0;
   for (const name of ["means", "splats"]) {
     for (const write of decodeTable(streams.get(name))) {
-      const column = new ARRAYS[streams.get(name).dtype](count);
-      write(column, 0, 1);
-      columns.push(column);
-      yield { progress: columns.length / (12 + rank) };
+      parts.forEach((columns, k) => {
+        const first = k * PART, end = Math.min(first + PART, count);
+        columns.push(new ARRAYS[streams.get(name).dtype](end - first));
+        write(columns.at(-1), -first, 1, first, end);
+      });
+      yield { progress: ++done / (12 + rank) };
     }
   }
-  expect(columns[0].every((upper) => upper < 2 ** 31), "its means are beyond 63 bits");
   const place = { upper: 0, lower: 0 };
-  for (let first = 0; first < count; first += part) {
-    const table = new Float32Array(buffer(), 0, 16 * Math.min(part, 1024 * Math.ceil((count - first) / 1024)));
-    const here = columns.map((column) => column.subarray(first, first + part));
-    fillTable(table, header.grids, place, here);
-    yield { table: [first, table] };
+  for (const [k, columns] of parts.entries()) {
+    expect(columns[0].every((upper) => upper < 2 ** 31), "its means are beyond 63 bits");
+    const table = new Float32Array(buffer(), 0, 16384 * Math.ceil(columns[0].length / 1024));
+    fillTable(table, header.grids, place, columns);
+    free(columns);
+    yield { table: [k * PART, table] };
   }
-  free(columns);
   const { low, step } = header.grids.latents;
   let r = 0, codes;
   for (const write of decodeTable(latents)) {
-    if (r % 4 === 0) codes = new Codes(buffer(), 0, 4 * WIDTH * rows);
+    if (r % 4 === 0) codes = new Codes(buffer(), 0, size);
     const ends = write(codes, r % 4, 4).map((code) => Math.fround(low[r] + step[r] * code));
     expect(ends.every(Number.isFinite), "its latents are not finite");
     if (++r % 4 === 0 || r === rank) yield { latents: [(r - 1) >> 2, codes] };
@@ -199,14 +204,15 @@ function readContainer(bytes) {
     const { name, dtype, shape, bytes: size, coding } = entry;
     expect(Array.isArray(shape) && shape.every(isCount) && isCount(size), `its stream ${name} has no size`);
     expect(!streams.has(name), `it has two streams ${name}`);
-    unpacked += BYTES[dtype] * shape.reduce((a, b) => a * Math.max(b, 1), 1);
+    unpacked += bytesOf(dtype) * shape.reduce((a, b) => a * Math.max(b, 1), 1);
     expect(unpacked <= Math.max(LARGEST_RATIO * total, SMALL), `its stream ${name} is too large`);
-    const body = bytes.subarray(at, at + size);
+    const body = bytes.slice(at, at + size);
     at += size;
     expect(body.length === size && crc32(body) === entry.crc32, `the checksum of its stream ${name} does not hold`);
     streams.set(name, { coding, dtype, shape, body });
   }
   expect(at === total, "it goes on after its last stream");
+  free([bytes]);
   return { header, streams };
 }
 
@@ -265,7 +271,7 @@ function crc32(bytes) {
 
 // The numbers of a stream of "xz": of two bytes as Uint16Array, of four as Uint32Array.
 function numbers({ dtype, shape, body }) {
-  const size = BYTES[dtype], n = shape.reduce((a, b) => a * b, 1), planes = unxz(body, size * n);
+  const size = bytesOf(dtype), n = shape.reduce((a, b) => a * b, 1), planes = unxz(body, size * n);
   const out = size === 2 ? new Uint16Array(n) : new Uint32Array(n);
   for (let k = 0; k < size; k++) for (let i = 0; i < n; i++) out[i] |= planes[k * n + i] << (8 * k);
   return out;
@@ -312,13 +318,11 @@ const PRECISION = 14, MASK = (1 << PRECISION) - 1, LOWEST = 1 << 16, DIRECT = 32
 const MOST_CONTEXTS = 16, MOST_MODEL = 13 + MOST_CONTEXTS * (3 + TOKENS), LARGEST_WEIGHT = 1 << 16;
 
 // Decodes a table; yields for each column write(out, first, stride), which puts the number of row i at first + i stride of
-// an array, and returns the least and the largest of a signed column.
+// an array, and returns the least and the largest of a signed column; or so only the rows `from` to `to`.
 function* decodeTable({ body, shape, dtype }) {
   const hold = (right) => expect(right, "one of its tables cannot be decoded");
   hold(shape.length === 2 && shape[0] <= 1024 && body.length >= 8);
   const [C, n] = shape, view = new DataView(body.buffer, body.byteOffset, body.byteLength);
-  const lowest = { int16: -(2 ** 15), int32: -(2 ** 31), uint32: 0 }[dtype];
-  const highest = { int16: 2 ** 15 - 1, int32: 2 ** 31 - 1, uint32: 2 ** 32 - 1 }[dtype];
   const count = view.getUint32(0, true), size = view.getUint32(4, true);
   hold(count <= MOST_MODEL * C && 8 + size <= body.length);
   const model = new Int32Array(numbers({ dtype: "uint32", shape: [count], body: body.subarray(8, 8 + size) }).buffer);
@@ -339,7 +343,7 @@ function* decodeTable({ body, shape, dtype }) {
   at -= raw.length;
 
   // Of a column and two to its left, in the order of decoding: row l S + t at (2 + t) lanes + l.
-  const columns = [0, 1, 2].map(() => new (dtype === "uint32" ? Uint32Array : Int32Array)((2 + S) * lanes));
+  const columns = [0, 1, 2].map(() => new ARRAYS[dtype]((2 + S) * lanes)), fresh = new Int32Array(lanes);
   const tokens = columns.map((column) => new Uint8Array(column.length));
   const chances = new Int32Array(MOST_CONTEXTS << 8);  // by context and token: its frequency, and 14 bits of its start
   const lookup = new Uint8Array(MOST_CONTEXTS << PRECISION), context = new Uint8Array(MOST_ACTIVITY + 1);
@@ -370,6 +374,9 @@ function* decodeTable({ body, shape, dtype }) {
     hold(shares.every((share) => share >= 0 && share <= 16));
     const [own, left, left2] = [0, 2, 1].map((k) => columns[(c + k) % 3]);
     const [said, near, near2] = [0, 2, 1].map((k) => tokens[(c + k) % 3]);
+    const small = dtype === "int16" && signed && weights.reduce((sum, w) => sum + Math.abs(w), 0) < 2 ** 16;
+    const step = small ? predictSmall : predict;
+    weights[0] += 128;  // to round
     for (let t = 0; t < S; t++) {
       const first = (2 + t) * lanes, active = Math.ceil((n - t) / S);
       if (coder.w + 3 * lanes > words.length) {
@@ -379,19 +386,20 @@ function* decodeTable({ body, shape, dtype }) {
         coder.w = 0;
       }
       // First all tokens of a step, then the low bits that they leave: words lie in this order.
-      takeTokens(coder, first, active, lanes, shares, context, lookup, chances, own, said, near, near2);
-      if (coder.most >= DIRECT && takeBits(coder, first, active, own, said, 0)) takeBits(coder, first, active, own, said, 16);
-      hold(predict(weights, own, left, left2, first, active, lanes, signed, lowest, highest));
+      takeTokens(coder, first, active, lanes, shares, context, lookup, chances, fresh, said, near, near2);
+      if (coder.most >= DIRECT && takeBits(coder, first, active, fresh, said, 0)) takeBits(coder, first, active, fresh, said, 16);
+      hold(step(weights, fresh, own, left, left2, first, active, lanes, signed));
     }
-    yield (out, first, stride) => {
+    yield (out, first, stride, from = 0, to = n) => {
       let least = own[2 * lanes], most = least;
-      for (let t = 0; t < S; t += 16) {  // as many neighbours in memory at once
-        for (let l = 0; l < lanes; l++) {
-          for (let k = t, end = Math.min(t + 16, S, n - l * S); k < end; k++) {
-            const value = own[(2 + k) * lanes + l];
-            out[first + stride * (l * S + k)] = value;
-            least = Math.min(least, value);
-            most = Math.max(most, value);
+      for (let t = 0; t < S; t += 64) {  // as many neighbours in memory at once
+        for (let l = Math.floor(from / S); l * S < to; l++) {
+          const source = 2 * lanes + l, target = first + stride * l * S;
+          for (let k = Math.max(t, from - l * S), end = Math.min(t + 64, S, to - l * S); k < end; k++) {
+            const value = own[source + k * lanes];
+            out[target + stride * k] = value;
+            if (value < least) least = value;
+            if (value > most) most = value;
           }
         }
       }
@@ -399,11 +407,11 @@ function* decodeTable({ body, shape, dtype }) {
     };
   }
   hold(at + 2 * coder.w === body.length && state.every((x) => x === LOWEST) && read === count);
-  free([...columns, ...tokens]);
+  free([...columns, ...tokens, body]);
 }
 
 // The tokens of a step; coder.most: no less than the largest.
-function takeTokens(coder, first, active, lanes, [s1, s2, s3, s4], context, lookup, chances, own, said, near, near2) {
+function takeTokens(coder, first, active, lanes, [s1, s2, s3, s4], context, lookup, chances, fresh, said, near, near2) {
   const { state, words } = coder;
   let { w } = coder, most = 0;
   for (let l = 0, j = first; l < active; l++, j++) {
@@ -415,37 +423,51 @@ function takeTokens(coder, first, active, lanes, [s1, s2, s3, s4], context, look
     const short = ((rest >>> 16) - 1) >>> 31;  // 1 if it is below 2^16: without a branch, which nobody could predict
     state[l] = (rest << (short << 4)) | (words[w] & -short);
     w += short;
-    said[j] = own[j] = token;
+    said[j] = fresh[l] = token;
     most |= token;
   }
   Object.assign(coder, { w, most });
 }
 
 // The low bits, from the bit `shift` on, that large tokens of a step leave; whether there are more.
-function takeBits(coder, first, active, own, said, shift) {
+function takeBits(coder, first, active, fresh, said, shift) {
   const { state, words } = coder;
-  let more = false;
+  let { w } = coder, more = false;
   for (let l = 0, j = first; l < active; l++, j++) {
     const large = said[j] - DIRECT;
     if (large < 0) continue;
     const spare = (large >> 2) + 3, bits = Math.min(Math.max(spare - shift, 0), 16), x = state[l], rest = x >>> bits;
-    if (shift === 0) own[j] = (4 + (large & 3)) << spare;
-    own[j] += (x & ((1 << bits) - 1)) << shift;
-    state[l] = rest >>> 16 ? rest : (rest << 16) | words[coder.w++];
+    const short = ((rest >>> 16) - 1) >>> 31;
+    fresh[l] = (shift ? fresh[l] : (4 + (large & 3)) << spare) + ((x & ((1 << bits) - 1)) << shift);
+    state[l] = (rest << (short << 4)) | (words[w] & -short);
+    w += short;
     if (spare > 16) more = true;
   }
+  coder.w = w;
   return more;
 }
 
 // Numbers of a step from what was read and from their neighbours; whether all are in their type's range.
-function predict([w0, w1, w2, w3, w4, w5, w6], own, left, left2, first, active, lanes, signed, lowest, highest) {
-  for (let j = first, end = first + active; j < end; j++) {
-    const b = j - lanes, u = own[j];
-    const sum = w0 + 128 + w1 * own[b] + w2 * own[b - lanes] + w3 * left[j] + w4 * left[b] +
-      w5 * left2[j] + w6 * left2[b];
+function predict([w0, w1, w2, w3, w4, w5, w6], fresh, own, left, left2, first, active, lanes, signed) {
+  for (let l = 0, j = first; l < active; l++, j++) {
+    const b = j - lanes, u = fresh[l];
+    const sum = w0 + w1 * own[b] + w2 * own[b - lanes] + w3 * left[j] + w4 * left[b] + w5 * left2[j] + w6 * left2[b];
     const x = signed ? Math.floor(sum / 256) + ((u >>> 1) ^ -(u & 1)) : u >>> 0;
-    if (x < lowest || x > highest) return false;
     own[j] = x;
+    if (own[j] !== x) return false;
+  }
+  return true;
+}
+
+// The same where 32 bits hold every sum, which takes half of the time.
+function predictSmall([w0, w1, w2, w3, w4, w5, w6], fresh, own, left, left2, first, active, lanes) {
+  for (let l = 0, j = first; l < active; l++, j++) {
+    const b = j - lanes, u = fresh[l];
+    const sum = w0 + imul(w1, own[b]) + imul(w2, own[b - lanes]) + imul(w3, left[j]) + imul(w4, left[b]) +
+      imul(w5, left2[j]) + imul(w6, left2[b]);
+    const x = ((sum >> 8) + ((u >>> 1) ^ -(u & 1))) | 0;
+    own[j] = x;
+    if (own[j] !== x) return false;
   }
   return true;
 }
@@ -494,7 +516,7 @@ const SLOT = 432, SPECIAL = 688, ALIGN = 816, LENGTH = 832, REP_LENGTH = 1346, L
 // Unpacks LZMA2 chunks from input[at]; returns where they end, and how many bytes of `output` are filled.
 function lzma2(input, at, output, dictionary, broken) {
   const coder = new Uint32Array(2);  // range, code: a typed array keeps them whole numbers
-  let probs = new Uint16Array(0), lc = 0, lp = 0, pb = 0, state = 0, rep0 = 0, rep1 = 0, rep2 = 0, rep3 = 0;
+  let probs = new Uint16Array(0), lc = 0, lp = 0, pb = 0, state = 0, reps = [0, 0, 0, 0];  // the last distances
   let filled = 0, origin = 0;  // bytes of the output, and where what may be repeated begins
   let needed = 3;  // what the next chunk must reset at least: 3 all, 2 the properties, 0 nothing
 
@@ -558,7 +580,7 @@ function lzma2(input, at, output, dictionary, broken) {
     const base = LITERAL + 0x300 * (((place & ((1 << lp) - 1)) << lc) + (before >> (8 - lc)));
     let symbol = 1;
     if (state >= 7) {
-      let match = output[filled - rep0 - 1], offset = 0x100;
+      let match = output[filled - reps[0] - 1], offset = 0x100;
       while (symbol < 0x100) {
         match <<= 1;
         const expected = match & offset, b = bit(base + offset + expected + symbol);
@@ -572,8 +594,8 @@ function lzma2(input, at, output, dictionary, broken) {
     state = state < 4 ? 0 : state < 10 ? state - 3 : state - 6;
   }
   function copy(count, end) {
-    if (rep0 >= Math.min(filled - origin, dictionary) || filled + count > end) throw broken();
-    for (let from = filled - rep0 - 1; count > 0; count--) output[filled++] = output[from++];
+    if (reps[0] >= Math.min(filled - origin, dictionary) || filled + count > end) throw broken();
+    for (let from = filled - reps[0] - 1; count > 0; count--) output[filled++] = output[from++];
   }
 
   for (;;) {
@@ -607,7 +629,7 @@ function lzma2(input, at, output, dictionary, broken) {
     }
     if (reset >= 1) {
       probs.fill(1024);
-      state = rep0 = rep1 = rep2 = rep3 = 0;
+      [state, reps] = [0, [0, 0, 0, 0]];
     }
     const chunkEnd = at + chunk, end = filled + count;
     if (chunkEnd > input.length || end > output.length || input[at] !== 0) throw broken();
@@ -619,29 +641,17 @@ function lzma2(input, at, output, dictionary, broken) {
       if (bit(IS_MATCH + (state << 4) + place) === 0) {
         literal();
       } else if (bit(IS_REP + state) === 0) {
-        rep3 = rep2;
-        rep2 = rep1;
-        rep1 = rep0;
         const count = length(LENGTH, place);
         state = state < 7 ? 7 : 10;
-        rep0 = distance(tree(SLOT + 64 * Math.min(count - 2, 3), 6));
+        reps = [distance(tree(SLOT + 64 * Math.min(count - 2, 3), 6)), ...reps.slice(0, 3)];
         copy(count, end);
       } else {
         let again = true;
         if (bit(IS_REP0 + state) === 0) {
           again = bit(IS_REP0_LONG + (state << 4) + place) === 1;
         } else {
-          let next = rep1;
-          if (bit(IS_REP1 + state) === 1) {
-            next = rep2;
-            if (bit(IS_REP2 + state) === 1) {
-              next = rep3;
-              rep3 = rep2;
-            }
-            rep2 = rep1;
-          }
-          rep1 = rep0;
-          rep0 = next;
+          const k = bit(IS_REP1 + state) === 0 ? 1 : 2 + bit(IS_REP2 + state);
+          reps.unshift(...reps.splice(k, 1));
         }
         const count = again ? length(REP_LENGTH, place) : 1;
         state = state < 7 ? (again ? 8 : 9) : 11;

@@ -111,20 +111,16 @@ class Painter {
       alpha: false, antialias: false, depth: false, stencil: false, powerPreference: "high-performance",
     }));
     if (!gl) throw new Lacking("The scene is drawn with WebGL 2, which this browser does not offer here. Turn on graphics acceleration in its settings, update it, or open the page in a current Chrome, Edge, Firefox or Safari.");
-    this.canvas = canvas;
-    const floats = gl.getExtension("EXT_color_buffer_float"), halfs = gl.getExtension("EXT_color_buffer_half_float");
-    this.exact = Boolean(floats || halfs);  // else pictures are blended in 8 bits
-    this.header = scene.header;
-    this.count = scene.count;
-    this.background = scene.header.render.background;
-    this.near = scene.header.render.near_plane;
-    this.largest = gl.getParameter(gl.MAX_TEXTURE_SIZE);
-    this.plan = plan(scene.header.head.config, scene.weights);
-    if (this.largest < WIDTH || this._height(scene.count, TABLE_TEXELS) > this.largest) {
-      throw new Lacking(`This device's textures are too small for ${scene.count.toLocaleString()} splats.`);
+    const wide = ["float", "half_float"].map((kind) => gl.getExtension(`EXT_color_buffer_${kind}`));
+    const { header, count } = scene, { background, near_plane: near } = header.render;
+    Object.assign(this, { canvas, header, count, background, near });
+    this.exact = wide.some(Boolean);  // else pictures are blended in 8 bits
+    this.plan = plan(header.head.config, scene.weights);
+    this.rows = Math.ceil(count / PER_ROW(TABLE_TEXELS));
+    if (gl.getParameter(gl.MAX_TEXTURE_SIZE) < Math.max(WIDTH, this.rows)) {
+      throw new Lacking(`This device's textures are too small for ${count.toLocaleString()} splats.`);
     }
 
-    this.rows = this._height(scene.count, TABLE_TEXELS);
     this.table = this._texture(gl.RGBA32F, WIDTH, this.rows);
     this.looks = this._texture(gl.RGBA32UI, PER_ROW(TABLE_TEXELS), this.rows);
     this.looksTarget = this._target(this.looks);
@@ -139,12 +135,17 @@ class Painter {
     const { gl } = this, y = first / PER_ROW(TABLE_TEXELS);
     gl.bindTexture(gl.TEXTURE_2D, this.table);
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, y, WIDTH, values.length / (4 * WIDTH), gl.RGBA, gl.FLOAT, values);
+    this._settle();
   }
 
   setLatents(layer, codes) {
     const { gl } = this, format = [gl.RGBA_INTEGER, codes.BYTES_PER_ELEMENT === 2 ? gl.SHORT : gl.INT];
     gl.bindTexture(gl.TEXTURE_2D_ARRAY, this.latents);
-    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, layer, WIDTH, this.height, 1, ...format, codes);
+    for (let y = 0; y < this.height; y += 32) {
+      const rows = Math.min(32, this.height - y);
+      gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, y, layer, WIDTH, rows, 1, ...format, codes, 4 * WIDTH * y);
+      this._settle();
+    }
   }
 
   // Computes what is kept of the first layers, once all is there; returns itself.
@@ -167,12 +168,14 @@ class Painter {
       gl.deleteProgram(keep.program);
       gl.deleteTexture(this.latents);
     }
-    if (gl.getError() === gl.OUT_OF_MEMORY) throw new Lacking("This device's graphics memory is too small for the scene.");
+    this._settle();
     return this;
   }
 
-  _height(count, each) {
-    return Math.max(1, Math.ceil(count / PER_ROW(each)));
+  // Waits until the GPU's process has taken what it was sent, and the page has its memory again.
+  _settle() {
+    const { gl } = this;
+    if (gl.getError() === gl.OUT_OF_MEMORY) throw new Lacking("This device's graphics memory is too small for the scene.");
   }
 
   _startField(scene) {
@@ -242,7 +245,7 @@ class Painter {
 
   // Draw onto the canvas. camera: {view, lens, size}, size that of the picture, which is stretched over the canvas.
   draw({ view, lens, size }, mode) {
-    const { gl, splats, show } = this;
+    const { gl, splats, show, canvas } = this;
     const [width, height] = size;
     this._resize(width, height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.target.buffer);
@@ -263,10 +266,10 @@ class Painter {
     gl.disable(gl.BLEND);
 
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.viewport(0, 0, this.canvas.width, this.canvas.height);
+    gl.viewport(0, 0, canvas.width, canvas.height);
     gl.useProgram(show.program);
     this._bind(show, { picture: this.target.texture });
-    gl.uniform2f(show.at("size"), this.canvas.width, this.canvas.height);
+    gl.uniform2f(show.at("size"), canvas.width, canvas.height);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 

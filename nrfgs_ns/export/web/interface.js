@@ -125,10 +125,10 @@ function offer() {
   // The page around this one, whoever made it, may move the camera. It is not given pictures: another site's page must
   // not read what a browser shows only because its reader may see it.
   const tell = (origin) => (message) =>
-    window.parent.postMessage({ nrfgs: VERSION_OF_INTERFACE, ...message }, origin === "null" ? "*" : origin);
+    parent.postMessage({ nrfgs: VERSION_OF_INTERFACE, ...message }, origin === "null" ? "*" : origin);
   let heard = false;
-  window.addEventListener("message", async ({ data, source, origin }) => {
-    if (source !== window.parent || source === window || data?.nrfgs !== VERSION_OF_INTERFACE) return;
+  addEventListener("message", async ({ data, source, origin }) => {
+    if (source !== parent || source === window || data?.nrfgs !== VERSION_OF_INTERFACE) return;
     const answer = tell(origin);
     try {
       await ready;
@@ -140,9 +140,9 @@ function offer() {
       answer({ id: data.id, error: error.message });
     }
   });
-  window.addEventListener("hashchange", readAddress);
+  addEventListener("hashchange", readAddress);
   ready.then(() => emit("ready"), () => {});
-  if (window.parent !== window) {
+  if (parent !== window) {
     on("ready", () => tell("*")({ event: "ready" }));
     on("failed", ({ message }) => tell("*")({ event: "failed", message }));
   }
@@ -167,13 +167,13 @@ async function measure(count) {
   measuring = false;
   fieldFor = null;
   wake();
-  const info = painter.gl.getExtension("WEBGL_debug_renderer_info");
+  const { gl } = painter;
   return {
     seconds_per_picture: seconds / count,
     seconds_to_sort: sortTook,
     size: [canvas.width, canvas.height],
     splats: painter.count,
-    renderer: painter.gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : painter.gl.RENDERER),
+    renderer: gl.getParameter(gl.getExtension("WEBGL_debug_renderer_info")?.UNMASKED_RENDERER_WEBGL ?? gl.RENDERER),
     browser: navigator.userAgent,
   };
 }

@@ -22,6 +22,15 @@ function planesOf({ view, lens: [fx, fy, cx, cy], size: [width, height] }, near)
   ]);
 }
 
+// The axes, as rows, of a unit quaternion.
+function axesOf([w, x, y, z]) {
+  return [
+    [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+    [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+    [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+  ];
+}
+
 class Order {
   // n splats. spare: buffers of 8 n bytes or more, for sorting, if there are any.
   constructor(n, spare) {
@@ -81,13 +90,9 @@ class Order {
       const x = means[3 * i] - eye[0], y = means[3 * i + 1] - eye[1], z = means[3 * i + 2] - eye[2];
       const far = x * direction[0] + y * direction[1] + z * direction[2];
       if (far <= 0 || x * x + y * y + z * z - far * far > reach[i] * reach[i]) continue;
-      // Where the ray passes nearest to the mean, in standard deviations along the splat's own axes.
-      const [qw, qx, qy, qz] = [0, 1, 2, 3].map((k) => (shapes[8 * i + k] - 128) / 127);
-      const axes = [
-        [1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy + qw * qz), 2 * (qx * qz - qw * qy)],
-        [2 * (qx * qy - qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz + qw * qx)],
-        [2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy)],
-      ];
+      // Where the ray passes nearest to the mean, in standard deviations along the splat's own axes: the columns of
+      // axesOf, or the rows for the inverse quaternion.
+      const axes = axesOf([128 - shapes[8 * i], ...[1, 2, 3].map((k) => shapes[8 * i + k] - 128)].map((q) => q / 127));
       let oo = 0, od = 0, dd = 0;
       for (let k = 0; k < 3; k++) {
         const [a, b, c] = axes[k], deviation = (shapes[8 * i + 4 + k] / 255) * (reach[i] / SIGMAS);

@@ -1,17 +1,18 @@
 // SPDX-License-Identifier: Apache-2.0
 // What people do and see besides the scene: pointers, keys, the panel, marks of photographs, notes.
 
-const noteViews = [];  // {box, button, text} for each note of `notes`
+let noteViews = [];  // {box, button, text} for each note of `notes`
 let notes = [], stored = [];  // {text, position, camera}; cameras of a tour that is being made
 let placing = false;          // the next point that is pressed gets a note
 let quiet = 0;
+const modes = document.body.classList;
 
 // For screen readers; seen: for everybody, for a few seconds.
 function say(text, seen = false) {
-  byId("said").textContent = text;
-  byId("said").classList.toggle("seen", seen);
+  const { classList } = Object.assign(byId("said"), { textContent: text });
+  classList.toggle("seen", seen);
   clearTimeout(quiet);
-  if (seen) quiet = setTimeout(() => byId("said").classList.remove("seen"), 5000);
+  if (seen) quiet = setTimeout(() => classList.remove("seen"), 5000);
 }
 
 // ---- where photographs were taken
@@ -54,8 +55,7 @@ function setNotes(list) {
   notes = list;
   byId("notes").replaceChildren();
   byId("note-list").replaceChildren();
-  noteViews.length = 0;
-  notes.forEach((note, index) => {
+  noteViews = notes.map((note, index) => {
     const add = (parent, tag, values) => {
       const element = Object.assign(document.createElement(tag), values);
       parent.append(element);
@@ -72,12 +72,12 @@ function setNotes(list) {
       }
       if (open && note.camera) flyTo(cameraOf(note.camera));
     });
-    noteViews.push({ box, button, text });
     const line = add(byId("note-list"), "div", { className: "row" });
     const input = add(line, "input", { value: note.text, ariaLabel: `Text of note ${index + 1}`, maxLength: 500 });
     input.addEventListener("input", () => (note.text = text.textContent = input.value));
     add(line, "button", { type: "button", textContent: "Remove", ariaLabel: `Remove note ${index + 1}` }).addEventListener("click", () =>
       setNotes(notes.filter((other) => other !== note)));
+    return { box, button, text };
   });
   byId("save-notes").disabled = notes.length === 0;
   stale = true;
@@ -95,7 +95,7 @@ function placeNotes() {
 
 async function placeNote(x, y) {
   placing = false;
-  document.body.classList.remove("placing");
+  modes.remove("placing");
   const position = await pick(x, y);
   if (!position) return say("There is nothing at that place. Add the note again.", true);
   setNotes([...notes, { text: "", position, camera: given(state.camera) }]);
@@ -110,15 +110,15 @@ async function placeNote(x, y) {
 function open(name) {
   byId("panel").hidden = name === null;
   for (const tab of document.querySelectorAll("#bar [aria-controls]")) {
-    const mine = tab.getAttribute("aria-controls") === name;
-    tab.setAttribute("aria-expanded", String(mine));
-    byId(tab.getAttribute("aria-controls")).hidden = !mine;
+    const part = tab.getAttribute("aria-controls");
+    tab.setAttribute("aria-expanded", part === name);
+    byId(part).hidden = part !== name;
   }
 }
 
 function playing(what) {
   byId("tour").textContent = what === "tour" ? "Stop tour" : "Tour";
-  byId("tour").setAttribute("aria-pressed", String(what === "tour"));
+  byId("tour").setAttribute("aria-pressed", what === "tour");
   byId("rotate").checked = what === "rotation";
 }
 
@@ -195,7 +195,7 @@ function listenToPanel() {
   });
   on("add-note", "click", () => {
     placing = true;
-    document.body.classList.add("placing");
+    modes.add("placing");
     if (sheet.matches) open(null);
     say("Press the place of the scene that the note is about.", true);
   });
@@ -226,19 +226,20 @@ const sheet = matchMedia("(max-width: 600px)");  // where the panel covers the s
 let flewAt = null;
 
 function listen() {
+  const on = canvas.addEventListener.bind(canvas);
   listenToPanel();
   for (const kind of ["pointerdown", "wheel", "keydown"]) {
-    window.addEventListener(kind, ({ target }) => {
+    addEventListener(kind, ({ target }) => {
       if (!target.closest?.("[data-plays]")) stop();
-      document.body.classList.toggle("pointing", kind !== "keydown");  // no frame around what a mouse drags
+      modes.toggle("pointing", kind !== "keydown");  // no frame around what a mouse drags
     }, { capture: true, passive: true });
   }
-  canvas.addEventListener("pointerdown", (event) => {
+  on("pointerdown", (event) => {
     canvas.setPointerCapture(event.pointerId);
     canvas.focus({ preventScroll: true });
     pointers.set(event.pointerId, { x: event.clientX, y: event.clientY, path: 0, button: event.button });
   });
-  canvas.addEventListener("pointermove", (event) => {
+  on("pointermove", (event) => {
     const pointer = pointers.get(event.pointerId);
     if (!pointer) return;
     const dx = event.clientX - pointer.x, dy = event.clientY - pointer.y;
@@ -257,7 +258,7 @@ function listen() {
     Object.assign(pointer, { x: event.clientX, y: event.clientY, path: pointer.path + Math.hypot(dx, dy) });
   });
   for (const kind of ["pointerup", "pointercancel"]) {
-    canvas.addEventListener(kind, (event) => {
+    on(kind, (event) => {
       const pointer = pointers.get(event.pointerId);
       pointers.delete(event.pointerId);
       if (kind !== "pointerup" || !(pointer?.path < 4)) return;
@@ -267,24 +268,24 @@ function listen() {
       else if (sheet.matches) open(null);
     });
   }
-  canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-  canvas.addEventListener("wheel", (event) => {
+  on("contextmenu", (event) => event.preventDefault());
+  on("wheel", (event) => {
     event.preventDefault();
     const lines = event.deltaMode === 1 ? 16 : 1;
     zoom(Math.exp(Math.max(-1, Math.min(1, 0.0015 * lines * event.deltaY))));
   }, { passive: false });
   // Look at what was double-clicked, and turn around it from now on.
-  canvas.addEventListener("dblclick", async (event) => {
+  on("dblclick", async (event) => {
     const point = await pick(event.clientX, event.clientY);
     if (!point) return;
     const { eye, axes } = state.camera, there = minus(point, eye);
     flyTo({ ...state.camera, axes: facing(there, axes[0]), distance: norm(there) });
   });
-  canvas.addEventListener("webglcontextlost", () => fail(new Lacking("The graphics device has gone away. Load the page again.")));
+  on("webglcontextlost", () => fail(new Lacking("The graphics device has gone away. Load the page again.")));
   document.addEventListener("keydown", pressed);
   document.addEventListener("keyup", (event) => held.delete(event.key.toLowerCase()));
-  window.addEventListener("blur", () => held.clear());
-  window.addEventListener("resize", wake);
+  addEventListener("blur", () => held.clear());
+  addEventListener("resize", wake);
 }
 
 function flyByKeys(now) {
@@ -304,7 +305,7 @@ function pressed(event) {
     open(null);
     tab?.focus();
     placing = false;
-    document.body.classList.remove("placing");
+    modes.remove("placing");
   }
   if (event.ctrlKey || event.metaKey || event.altKey || /INPUT|SELECT|TEXTAREA/.test(event.target.tagName)) return;
   const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
@@ -312,7 +313,7 @@ function pressed(event) {
     ArrowLeft: () => turn(0.08, 0), ArrowRight: () => turn(-0.08, 0), ArrowUp: () => turn(0, 0.08),
     ArrowDown: () => turn(0, -0.08), "+": () => zoom(0.9), "=": () => zoom(0.9), "-": () => zoom(1 / 0.9),
     "[": () => byId("previous").click(), "]": () => byId("next").click(), Home: () => visit(about.start),
-    f: () => byId("freeze").click(), h: () => document.body.classList.toggle("bare"),
+    f: () => byId("freeze").click(), h: () => modes.toggle("bare"),
   };
   if ("wasdqe".includes(key)) {
     held.add(key);
