@@ -134,7 +134,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         except (FileNotFoundError, LookupError) as error:  # of nerfstudio's own parsers
             raise InputError(
                 f"{config.data or config.dataparser.data} cannot be read ({type(error).__name__}: {error}). Check the "
-                "path that --data names, and what kind of data set it is."
+                "path in --data or config.yml, and what kind of data set it is."
             ) from error
 
     def load_all_images(self) -> tuple[int, int]:
