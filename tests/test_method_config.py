@@ -39,6 +39,13 @@ def test_nerfstudio_finds_the_method(name):
     assert tyro.cli(AnnotatedBaseConfigUnion, args=[name, "--data", "x"]).method_name == name
 
 
+@pytest.mark.parametrize("parser", ["nerfstudio-data", "colmap"])
+def test_a_parser_that_is_named_has_splatfactos_defaults(parser):
+    """nerfstudio-data by itself leaves the points out; splatfacto's reads them."""
+    ours, theirs = (tyro.cli(AnnotatedBaseConfigUnion, args=[name, parser]) for name in ("nrfgs", "splatfacto"))
+    assert ours.pipeline.datamanager.dataparser == theirs.pipeline.datamanager.dataparser
+
+
 @pytest.mark.parametrize(
     "method, kind, decay", [(menu.nrfgs_vdgs, torch.optim.Adam, 0.0), (menu.nrfgs_gsnb, torch.optim.AdamW, 0.01)]
 )

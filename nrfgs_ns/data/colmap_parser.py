@@ -33,7 +33,7 @@ class NrfgsColmapDataParser(NrfgsDataParser):
     def _read(self) -> tuple[dict[str, Any], Path]:
         config = self.config
         if not os.path.exists(config.data):
-            raise InputError(f"{shown(str(config.data))}: no such folder. Check the path that --data names.")
+            raise InputError(f"{shown(str(config.data))}: no such folder. Check the path in --data or config.yml.")
         cameras, photographs, source = read_model(self._colmap)
         kinds = {cameras[photograph.camera]["camera_model"] for photograph in photographs}
         if len(kinds) > 1:

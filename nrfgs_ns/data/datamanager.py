@@ -14,14 +14,16 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 import torch
+import tyro
 from nerfstudio.cameras.cameras import Cameras, CameraType
-from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
+from nerfstudio.configs.dataparser_configs import all_dataparsers
 from nerfstudio.data.datamanagers.full_images_datamanager import (
     FullImageDatamanager,
     FullImageDatamanagerConfig,
     _undistort_image,
 )
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
@@ -39,6 +41,11 @@ LENS = ("fx", "fy", "cx", "cy", "width", "height")
 """Fields of a camera that undistortion changes."""
 PAGE = 4096
 """Bytes."""
+WITH_POINTS = {"nerfstudio-data": NerfstudioDataParserConfig(load_3D_points=True)}
+DataParsers = tyro.conf.OmitSubcommandPrefixes[
+    tyro.extras.subcommand_type_from_defaults(all_dataparsers | WITH_POINTS, prefix_names=False)
+]
+"""nerfstudio's choice of parsers, of which `nerfstudio-data` reads points without being asked, as in splatfacto."""
 
 
 class NrfgsInputDataset(InputDataset):
@@ -95,7 +102,7 @@ class NrfgsDatamanagerConfig(FullImageDatamanagerConfig):
     """nerfstudio's full-image datamanager, with images as uint8, in a quarter of the memory."""
 
     _target: type = field(default_factory=lambda: NrfgsDatamanager)
-    dataparser: AnnotatedDataParserUnion = field(default_factory=NrfgsDataParserConfig)
+    dataparser: DataParsers = field(default_factory=NrfgsDataParserConfig)
     """specifies the dataparser config"""
     cache_images_type: Literal["uint8", "float32"] = "uint8"
     """The image type returned from manager, caching images in uint8 saves memory"""
@@ -127,7 +134,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         except (FileNotFoundError, LookupError) as error:  # of nerfstudio's own parsers
             raise InputError(
                 f"{config.data or config.dataparser.data} cannot be read ({type(error).__name__}: {error}). Check the "
-                "path that --data names, and what kind of data set it is."
+                "path in --data or config.yml, and what kind of data set it is."
             ) from error
 
     def load_all_images(self) -> tuple[int, int]:

@@ -277,7 +277,7 @@ class NrfgsDataParser(DataParser):
 def read_transforms(data: Path) -> tuple[dict[str, Any], Path]:
     """The content of the transforms.json of `data`, a folder or the file itself, with at least one frame; its path."""
     if not os.path.exists(data):
-        raise InputError(f"{shown(str(data))}: no such file or folder. Check the path that --data names.")
+        raise InputError(f"{shown(str(data))}: no such file or folder. Check the path in --data or config.yml.")
     source = data if data.suffix == ".json" else data / "transforms.json"
     if not source.is_file():
         raise InputError(f"{source} is missing. {_advice_without_transforms(data)}")

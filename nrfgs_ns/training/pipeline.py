@@ -72,6 +72,9 @@ class NrfgsPipeline(VanillaPipeline):
 
     def __init__(self, config: NrfgsPipelineConfig, device: str, test_mode: str = "val", **kwargs):
         allow_nerfstudio_checkpoints()
+        parser = getattr(config.datamanager, "dataparser", None)
+        if isinstance(factor := getattr(parser, "downscale_factor", None), float) and factor.is_integer():
+            parser.downscale_factor = int(factor)  # `ns-render dataset` reads it as a float
         check_types(config, "config.yml", "pipeline.")  # nerfstudio's commands construct whatever the file holds
         if test_mode == "val" and config.compact is not None:
             raise InputError(f"pipeline.compact is {config.compact}; a training begins with --load-dir. Leave it out.")

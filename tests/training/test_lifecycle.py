@@ -18,6 +18,7 @@ from torch.testing import assert_close
 
 from nrfgs_lab.training_run import evaluate
 from nrfgs_ns.appearance import gsnb, sg
+from nrfgs_ns.data.pictures import read_size
 from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training import progress, trainer_config
@@ -107,6 +108,9 @@ def test_train_eval_render(method, finished, tmp_path, tiny_scene, recwarn):
     for output in ("rgb", "depth", "accumulation", "gt-rgb"):
         folder = tmp_path / "renders" / "test" / output
         assert sorted(file.stem for file in folder.rglob("*.png")) == sorted(Path(name).stem for name in names)
+    half = {"image_format": "png", "rendered_output_names": ["rgb", "gt-rgb"], "downscale_factor": 2.0}
+    DatasetRender(load_config=config, output_path=tmp_path / "half", **half).main()
+    assert [read_size(file) for file in (tmp_path / "half").rglob("*.png")] == 4 * [(24, 18)]
 
 
 @pytest.mark.parametrize("method", METHODS)
