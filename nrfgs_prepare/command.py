@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """`nrfgs prepare PHOTOS OUT`: the stages in order, their dependencies, and the verdict.
 
-OUT/work/state.json has the key of each stage that was begun: a digest of the input's bytes, the stage's options and
-the previous key. A finished stage with the same key is skipped, an unfinished one continues; files of another key are
-removed. Running a stage forgets the later ones.
+`work/state.json` in OUT has the key of each stage that was begun: a digest of the input's bytes, the stage's options
+and the previous key. A finished stage with the same key is skipped, an unfinished one continues; files of another key
+are removed. Running a stage forgets the later ones.
 """
 
 import hashlib
