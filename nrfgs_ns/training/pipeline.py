@@ -28,6 +28,7 @@ from nrfgs_ns.image.metrics import METRIC_NAMES, lpips_advice
 from nrfgs_ns.kernels.trial import tried_meanwhile
 from nrfgs_ns.model.config import NrfgsModelConfig
 from nrfgs_ns.rasterizer import load_kernels
+from nrfgs_ns.threads import few_threads
 from nrfgs_ns.training import optimizers
 from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints
 from nrfgs_ns.training.config_file import check_types
@@ -70,6 +71,7 @@ class NrfgsPipeline(VanillaPipeline):
 
     config: NrfgsPipelineConfig
 
+    @few_threads()  # a start is many small operations
     def __init__(self, config: NrfgsPipelineConfig, device: str, test_mode: str = "val", **kwargs):
         allow_nerfstudio_checkpoints()
         parser = getattr(config.datamanager, "dataparser", None)

@@ -13,7 +13,7 @@ from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.render import DatasetRender
 from nerfstudio.utils.eval_utils import eval_setup
 from rich.console import Console
-from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
+from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained, untrained
 from torch.testing import assert_close
 
 from nrfgs_lab.training_run import evaluate
@@ -21,7 +21,7 @@ from nrfgs_ns.appearance import gsnb, sg
 from nrfgs_ns.data.pictures import read_size
 from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.training import progress, trainer_config
+from nrfgs_ns.training import pipeline, progress, trainer_config
 from nrfgs_ns.training.checkpoint_files import read_latest
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -191,3 +191,15 @@ def test_the_size_of_large_or_smaller_photographs_is_said(tiny_scene, tmp_path, 
         set_up([*args, "nrfgs-data", "--data", str(tiny_scene), "--downscale-factor", factor])
         lines.append(re.findall(r"Images are read at .*, (\d+ x \d+) .*--downscale-factor", capsys.readouterr().out))
     assert lines == [[], ["24 x 18"], ["48 x 36"]]
+
+
+def test_a_start_takes_one_thread_of_the_cpu(tiny_scene, tmp_path, monkeypatch):
+    """Beside another process many small operations take a hundred times as long with several."""
+    counts, before = [], torch.get_num_threads()
+    monkeypatch.setattr(pipeline, "photograph_model", lambda *_: counts.append(torch.get_num_threads()))
+    torch.set_num_threads(2)
+    try:
+        untrained(tiny_scene, tmp_path)
+        assert (counts, torch.get_num_threads()) == ([1], 2)
+    finally:
+        torch.set_num_threads(before)
