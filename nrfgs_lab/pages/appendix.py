@@ -51,8 +51,7 @@ def rivals() -> str:
 
 
 def _changes(sitting: str, trial: str) -> dict[str, tuple[float, float, float]]:
-    """Changes by a trial of a sitting, against its default with the same seeds, by capture: PSNR, SSIM, and the share
-    of the default's splats."""
+    """Changes by a trial against its sitting's default, same seeds, by capture: PSNR, SSIM, share of splats."""
     runs = {(one["name"], one["scene"], one.get("seed")): one for one in records("trials").values()}
     pairs = defaultdict(list)
     for (name, scene, seed), one in runs.items():
@@ -75,8 +74,7 @@ def changes(trials: dict[str, str], sitting: str) -> str:
 
 
 def trial_changes(sitting: str, middle: bool = False) -> str:
-    """Mean changes by all trials of a sitting against its default over splits: dB, with their standard error; or the
-    median changes and on how many splits SSIM is higher."""
+    """Mean changes by a sitting's trials over splits, dB with their standard error; or medians, and whose SSIM wins."""
     runs, changes = records("trials"), defaultdict(list)
     for key, one in runs.items():
         at, _, trial = one.get("name", "").partition(": ")
@@ -128,6 +126,7 @@ BLOCKS = {
     "captures.logit": logit,
     "tables.gaps": lambda: changes(GAPS, "gaps"),
     "tables.today": lambda: trial_changes("today"),
+    "tables.fewest": lambda: trial_changes("9 to 12 views"),
     "tables.harmonics": lambda: trial_changes("today, harmonics", middle=True),
     "tables.scale": scale,
 }

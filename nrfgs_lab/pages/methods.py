@@ -157,18 +157,28 @@ def over(other: str, run: str = "field") -> str:
     return verdicts({f"`{scene}`": [seated(scene, name) for name in (run, other)] for scene in list(VIEWS)[:4]})
 
 
-def rates(head: str) -> str:
-    """The settings chosen for a head at the pixel: of each knob the best, with its mean gain over captures in dB."""
+def setting_gains(head: str) -> dict[str, float]:
+    """Mean gain over captures of each setting tried for a head at the pixel, in dB, by knob and setting."""
     tried: dict[str, dict[str, float]] = defaultdict(dict)
     for name, one in records("rates").items():
         if name.startswith(f"{head}/"):
             tried[one["cell"]["run"]][one["cell"]["scene"]] = one["measured"]["test"]["psnr"]
-    plain, best = tried.pop("default"), {}
-    for run, psnr in tried.items():
+    plain = tried.pop("default")
+    return {run: fmean(psnr[scene] - plain[scene] for scene in plain) for run, psnr in tried.items()}
+
+
+def rates(head: str) -> str:
+    """The settings chosen for a head at the pixel: of each knob the best, with its gain."""
+    best: dict[str, tuple[float, str]] = {}
+    for run, won in setting_gains(head).items():
         knob, _, setting = run.partition(" ")
-        won = fmean(psnr[scene] - plain[scene] for scene in plain)
         best[knob] = max(best.get(knob, (0.1, "")), (won, setting))
     return ", ".join(f"{setting} {signed(won, 2)}" for won, setting in best.values() if setting)
+
+
+def wider() -> str:
+    """Most that a setting beyond the chosen ones gains, of the network and of the convolutions."""
+    return " and ".join(signed(max(setting_gains(f"wide-{head}").values()), 2) for head in ("deferred", "latent-spec"))
 
 
 def seats() -> str:
@@ -239,6 +249,6 @@ def noise() -> str:
 
 BLOCKS = {
     **{f"comparison.{block.__name__}": block for block in (every, parts, over_gsnb, chosen)},
-    **{f"equal.{block.__name__}": block for block in (at_equal_numbers, over, rates, first_rule, seats)},
+    **{f"equal.{block.__name__}": block for block in (at_equal_numbers, over, rates, wider, first_rule, seats)},
     **{f"deviations.{block.__name__}": block for block in (worth, noise)},
 }
