@@ -34,9 +34,8 @@ from torch import Tensor
 from nrfgs_ns.appearance.field import Field
 from nrfgs_ns.appearance.head import SplatAppearance, base_colors
 from nrfgs_ns.appearance.sh import num_bases, sh_bases
-from nrfgs_ns.model.renderer import View
 from nrfgs_ns.progress import progress
-from nrfgs_ns.rasterizer import contributions
+from nrfgs_ns.rasterizer import View, contributions
 
 DEGREE = 3
 """Degree of the harmonics in a 3DGS file."""

@@ -29,7 +29,7 @@ from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.data.datamanager import NrfgsInputDataset
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.image.photograph import BASIS, exposed
-from nrfgs_ns.model.renderer import View
+from nrfgs_ns.rasterizer import View
 from nrfgs_ns.viewer import pictures as drawn
 from nrfgs_ns.viewer import start
 from nrfgs_ns.viewer.pictures import BASE, DEPTH, FULL, VIEW_DEPENDENCE, PictureOptions, legends, picture
