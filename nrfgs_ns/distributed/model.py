@@ -9,6 +9,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
+from nrfgs_ns.appearance.head import ViewNoise
 from nrfgs_ns.densification import Densification
 from nrfgs_ns.distributed import comm
 from nrfgs_ns.distributed.exchange import send_to_cameras
@@ -17,7 +18,6 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.photograph import PhotographModel
 from nrfgs_ns.model.loss import shrinkage
 from nrfgs_ns.model.model import NrfgsModel
-from nrfgs_ns.model.view_noise import ViewNoise
 from nrfgs_ns.rasterizer import Pinhole, Projection, View, project, project_view
 from nrfgs_ns.training.pipeline import ShardingConfig
 

@@ -18,7 +18,7 @@ import torch
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.head import Field
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, Similarity, to_capture

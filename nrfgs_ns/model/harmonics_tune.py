@@ -13,10 +13,10 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch.nn.functional import pad
 
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.head import Field
 from nrfgs_ns.appearance.sh import ShConfig
+from nrfgs_ns.data.views import camera_spacing
 from nrfgs_ns.model.harmonics_fit import DEGREE, PlainSplats, no_larger
-from nrfgs_ns.model.view_noise import camera_spacing
 from nrfgs_ns.progress import progress
 from nrfgs_ns.rasterizer import View, composite_view
 

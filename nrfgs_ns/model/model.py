@@ -21,9 +21,9 @@ from nerfstudio.utils.colors import get_color
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
-from nrfgs_ns.appearance.field import Field
-from nrfgs_ns.appearance.head import AppearanceHeadConfig, SplatAppearance
+from nrfgs_ns.appearance.head import AppearanceHeadConfig, Field, SplatAppearance, ViewNoise
 from nrfgs_ns.data.checks import warn
+from nrfgs_ns.data.views import camera_spacing
 from nrfgs_ns.densification import Densification
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image import robust
@@ -34,7 +34,6 @@ from nrfgs_ns.model.exported import ExportedModel
 from nrfgs_ns.model.initial_splats import initial_splats
 from nrfgs_ns.model.loss import loss_of
 from nrfgs_ns.model.saved_state import check_compatible, differences, photographs_of, reduced_config
-from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 from nrfgs_ns.model.warmup import warm_up
 from nrfgs_ns.rasterizer import (
     FAR_PLANE,
@@ -235,7 +234,7 @@ class NrfgsModel(ExportedModel):
         return None if index is None or self.photograph is None else lambda rgb: self.photograph(rgb, index)
 
     def noisy(self, field: Field) -> Field:
-        """A field as its head sees it: in training, under noise (`view_noise.py`)."""
+        """A field as its head sees it: in training, under `ViewNoise`."""
         noise = self.view_noise.generator(self.device, self.step) if self.training else None
         return field._replace(splats=self.view_noise.moved(field.splats, noise))
 

@@ -22,7 +22,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.func import functional_call
 
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.head import Field
 from nrfgs_ns.data.checks import warn
 from nrfgs_ns.densification import memory
 from nrfgs_ns.image.metrics import WINDOW_SIZE

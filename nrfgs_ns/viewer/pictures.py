@@ -19,8 +19,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.colormaps import apply_float_colormap
 from torch import Tensor
 
-from nrfgs_ns.appearance.field import Field
-from nrfgs_ns.appearance.head import SplatAppearance
+from nrfgs_ns.appearance.head import Field, SplatAppearance
 from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.rasterizer import View, composite
 

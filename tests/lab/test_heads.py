@@ -11,7 +11,7 @@ from short_trainings import command_line, trained
 from nrfgs_lab.heads.deferred import DeferredConfig
 from nrfgs_lab.heads.latent_spec import LatentSpecConfig
 from nrfgs_lab.training_run import evaluate
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.head import Field
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Compact, Ply, Web
 from nrfgs_ns.rasterizer import Pinhole, ProjectionOptions, composite_view, project_view, world_to_camera

@@ -15,8 +15,7 @@ from pytorch_msssim import SSIM
 from short_trainings import untrained
 from torch.testing import assert_close
 
-from nrfgs_ns.appearance.field import Field
-from nrfgs_ns.appearance.head import SplatAppearance
+from nrfgs_ns.appearance.head import Field, SplatAppearance
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.model.model import NrfgsModel, Pinholes, pinhole

@@ -22,8 +22,7 @@ from torch.testing import assert_close
 from viser.infra import _infra
 
 from nrfgs_lab.scenes import SceneConfig, write_scene
-from nrfgs_ns.appearance.field import Field
-from nrfgs_ns.appearance.head import SplatAppearance
+from nrfgs_ns.appearance.head import Field, SplatAppearance
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.data.datamanager import NrfgsInputDataset
