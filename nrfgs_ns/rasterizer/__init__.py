@@ -129,16 +129,16 @@ class View(NamedTuple):
         return self.projection.gaussian_ids
 
 
-def _backend(device: torch.device):
-    """The module that projects and composites on a device. Imported late: the CPU path must never load CUDA code."""
+def _backend(device: torch.device, stage: str):
+    """The module of a stage on a device; gsplat's has both. Imported late: the CPU path must never load CUDA code."""
     if device.type not in ("cuda", "cpu"):
         raise NotImplementedError(f"splats are on device {device}; the rasterizer runs on 'cuda' and 'cpu'")
-    return import_module(f"{__name__}.{'gsplat_cuda' if device.type == 'cuda' else 'torch_cpu'}")
+    return import_module(f"{__name__}.{'gsplat_cuda' if device.type == 'cuda' else f'torch_cpu.{stage}'}")
 
 
 def load_kernels(device: torch.device) -> None:
     """Load a CUDA device's kernels now. A gsplat without compiled kernels compiles them, once, for minutes."""
-    _backend(device).load_kernels(device)
+    _backend(device, "projection").load_kernels(device)
 
 
 def project_view(splats: Mapping[str, Tensor], pinhole: Pinhole, options: ProjectionOptions) -> View:
@@ -171,7 +171,7 @@ def project(
         Ks: pinhole intrinsics in pixels, without skew. [C, 3, 3]
         width, height: image size in pixels.
     """
-    return _backend(means.device).project((means, quats, scales), (viewmats, Ks, width, height), options)
+    return _backend(means.device, "projection").project((means, quats, scales), (viewmats, Ks, width, height), options)
 
 
 def composite_view(
@@ -254,7 +254,7 @@ def composite(
         on CUDA also flatten_ids and isect_offsets, the lists of the splats that each tile draws.
     """
     colors, opacities = colors.to(projection.depths.dtype), opacities.to(projection.depths.dtype)
-    backend = _backend(colors.device)
+    backend = _backend(colors.device, "compositing")
     leave_out = not assume_finite and backend.leaves_out(projection, colors, opacities)
     if not assume_finite and not leave_out:
         # One such row would spread over every pixel that it covers, and from there into the gradients of all splats.
