@@ -35,16 +35,7 @@ from nrfgs_ns.model.initial_splats import initial_splats
 from nrfgs_ns.model.loss import loss_of
 from nrfgs_ns.model.saved_state import check_compatible, differences, photographs_of, reduced_config
 from nrfgs_ns.model.warmup import warm_up
-from nrfgs_ns.rasterizer import (
-    FAR_PLANE,
-    NEAR_PLANE,
-    Pinhole,
-    ProjectionOptions,
-    View,
-    composite_view,
-    project_view,
-    world_to_camera,
-)
+from nrfgs_ns.rasterizer import Pinhole, ProjectionOptions, View, composite_view, project_view, world_to_camera
 
 NEAR_SHARE = 0.5
 """Near plane of `near_plane` auto, in the depth of the nearest points (`data.views.nearest_depth`)."""
@@ -186,12 +177,12 @@ class NrfgsModel(ExportedModel):
         """The camera for the rasterizer; training cameras whose pose is not learnt are converted once."""
         if not self.training:
             return self.pinholes.fixed(camera, self.device)
-        of_training = index, downscale = (camera.metadata or {}).get("cam_idx"), self._get_downscale_factor()
+        index, downscale = (camera.metadata or {}).get("cam_idx"), self._get_downscale_factor()
         if index is None or self.config.camera_optimizer.mode != "off":
             return pinhole(camera, self.camera_optimizer.apply_to_camera(camera), downscale)
-        if of_training not in self._of_training:
-            self._of_training[of_training] = pinhole(camera, camera.camera_to_worlds, downscale)
-        return self._of_training[of_training]
+        if (index, downscale) not in self._of_training:
+            self._of_training[index, downscale] = pinhole(camera, camera.camera_to_worlds, downscale)
+        return self._of_training[index, downscale]
 
     def _get_downscale_factor(self) -> int:
         risen = self.schedule_step // self.config.resolution_schedule
@@ -199,7 +190,7 @@ class NrfgsModel(ExportedModel):
 
     @property
     def projection_options(self) -> ProjectionOptions:
-        near, far = NEAR_PLANE * self.scene_unit, FAR_PLANE * self.scene_unit
+        near, far = (self.scene_unit * plane for plane in (ProjectionOptions.near_plane, ProjectionOptions.far_plane))
         if self.config.near_plane == "auto":
             near = max(near, self.near)
         # In training the guard finds numbers that are not finite.

@@ -26,8 +26,6 @@ from nrfgs_ns.appearance.head import SplatAppearance
 
 RasterizeMode = Literal["classic", "antialiased"]
 
-NEAR_PLANE, FAR_PLANE = 0.01, 1e10
-"""Depths between which splats are drawn, in scene units: splatfacto's."""
 EPS2D = 0.3
 """Blur added to the 2D covariances, in square pixels."""
 TILE_SIZE = 16
@@ -36,13 +34,13 @@ TILE_SIZE = 16
 
 @dataclass(frozen=True)
 class ProjectionOptions:
-    """Options of a projection."""
+    """Options of a projection. Its planes are splatfacto's where a scene unit is a world unit."""
 
     rasterize_mode: RasterizeMode = "classic"
     """classic: the blur makes splats wider. antialiased: it also makes them fainter, so that their light is kept"""
-    near_plane: float = NEAR_PLANE
+    near_plane: float = 0.01
     """smallest visible depth, in world units"""
-    far_plane: float = FAR_PLANE
+    far_plane: float = 1e10
     """largest visible depth, in world units"""
     assume_finite: bool = False
     """do not check that splats are finite, which costs a GPU a wait; a training's guard finds those that are not"""
