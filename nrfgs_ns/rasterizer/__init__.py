@@ -101,7 +101,7 @@ class Pinhole(NamedTuple):
 
 
 def world_to_camera(camera_to_world: Tensor) -> Tensor:
-    """World-to-camera matrices [C, 4, 4] (OpenCV: y down, z forwards) from nerfstudio's poses [C, 3, 4] (OpenGL)."""
+    """World-to-camera matrices [C, 4, 4] (OpenCV: y down, z forwards) from poses [C, 3, 4] (OpenGL: y up, z back)."""
     right, up_and_back, center = camera_to_world[:, :3].split([1, 2, 1], dim=2)
     rotation = torch.cat([right, -up_and_back], dim=2).transpose(1, 2)
     matrices = pad(torch.cat([rotation, -rotation @ center], dim=2), (0, 0, 0, 1))
@@ -128,7 +128,7 @@ class View(NamedTuple):
 
 
 def _backend(device: torch.device, stage: str):
-    """The module of a stage on a device; gsplat's has both. Imported late: the CPU path must never load CUDA code."""
+    """The module with a stage, "projection" or "compositing". Imported late: the CPU path must never load CUDA code."""
     if device.type not in ("cuda", "cpu"):
         raise NotImplementedError(f"splats are on device {device}; the rasterizer runs on 'cuda' and 'cpu'")
     return import_module(f"{__name__}.{'gsplat_cuda' if device.type == 'cuda' else f'torch_cpu.{stage}'}")
