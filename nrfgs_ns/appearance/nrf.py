@@ -161,7 +161,7 @@ class NeuralResidualField(AppearanceHead):
         return {**super().splat_params(rgb), "latents": latents}
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
-        if self.fused.takes(splats):
+        if self.fused.takes(splats):  # Triton, on CUDA
             return SplatAppearance(*self.fused(splats, visible, camera_centers, self.scene_unit))
         out = self._branches(splats, visible, camera_centers)
         opacities = self._opacity(out).squeeze(-1)
