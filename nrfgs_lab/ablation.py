@@ -17,7 +17,7 @@ from rich.table import Column, Table
 from torch.utils.benchmark import Timer
 
 from nrfgs_lab.training_run import machine
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.head import Field
 from nrfgs_ns.appearance.nrf import NeuralResidualField
 from nrfgs_ns.appearance.reduce import LatentBasis, branches, latent_basis, rebuilt, with_rank
 from nrfgs_ns.compact.finetune import contributions_to

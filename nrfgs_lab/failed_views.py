@@ -16,8 +16,7 @@ from torch import Tensor
 
 from nrfgs_ns.data.views import nearest_depth
 from nrfgs_ns.image.metrics import psnr
-from nrfgs_ns.model.renderer import world_to_camera
-from nrfgs_ns.rasterizer import contributions
+from nrfgs_ns.rasterizer import contributions, world_to_camera
 from nrfgs_ns.trained.loading import load_model
 
 LEAST_SHOWN = 1.0

@@ -17,8 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from nrfgs_lab.heads.features import FeatureHead
-from nrfgs_ns.appearance.encoding import NEAREST, unit_vectors
-from nrfgs_ns.appearance.head import AppearanceHeadConfig
+from nrfgs_ns.appearance.head import NEAREST, AppearanceHeadConfig, unit_vectors
 from nrfgs_ns.appearance.sh import num_bases, sh_bases
 
 DIRECTION_DEGREE = 3

@@ -20,8 +20,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from nrfgs_ns.appearance.encoding import BAND_DIM, NEAREST, fourier_bands, unit_vectors
-from nrfgs_ns.appearance.head import SplatAppearance, layers
+from nrfgs_ns.appearance.head import NEAREST, SplatAppearance, layers, unit_vectors
+from nrfgs_ns.appearance.nrf import BAND_DIM, fourier_bands
 from nrfgs_ns.appearance.sh import ShConfig, SphericalHarmonics, eval_sh, num_bases
 
 RAMP_STEPS = 5000

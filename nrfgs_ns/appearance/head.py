@@ -4,13 +4,16 @@
 A head defines the numbers that a splat stores (`splat_params`), which densification, optimisers and checkpoints carry
 without knowing their meaning; colours and opacities of the splats that a camera sees (`forward`); and their part that
 does not depend on the view (`base_appearance`). Shared weights are the head's own parameters.
+
+A field is a head and the table of splats that it draws; in training the head sees the field under `ViewNoise`.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -19,6 +22,8 @@ from nrfgs_ns.errors import InputError
 
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi))."""
+NEAREST = 0.01
+"""Smallest camera distance, in scene units: the near plane, closer than which nothing is drawn."""
 
 
 class SplatAppearance(NamedTuple):
@@ -160,6 +165,94 @@ class AppearanceHead(nn.Module, ABC):
         return None
 
 
+class Sight(Protocol):
+    """Which splats are seen, and from where."""
+
+    @property
+    def visible(self) -> Tensor:
+        """Rows of the table, int64 [M]; a row occurs once for each camera that sees the splat."""
+
+    @property
+    def center(self) -> Tensor:
+        """Camera centres in world coordinates, [3] or [M, 3]."""
+
+
+class Field(NamedTuple):
+    """A head and the table of the splats that it draws."""
+
+    head: AppearanceHead
+    splats: Mapping[str, Tensor]
+    """"means", "opacities" and the head's `splat_params`, [N, ...]"""
+
+    def seen_from(self, view: Sight) -> SplatAppearance:
+        """Colours and opacities of the M splats that a view sees."""
+        return self.head(self.splats, view.visible, view.center)
+
+    def base_of(self, view: Sight) -> SplatAppearance:
+        """Their part that does not depend on the camera."""
+        return self.head.base_appearance(self.splats, view.visible)
+
+    def components_of(self, view: Sight) -> dict[str, Component]:
+        """Parts of the head's result (`AppearanceHead.components`)."""
+        return self.head.components(self.splats, view.visible, view.center)
+
+    def detached(self) -> "Field":
+        """The same without gradients to the table."""
+        return Field(self.head, {name: value.detach() for name, value in self.splats.items()})
+
+    @property
+    def bytes(self) -> int:
+        """Bytes that a renderer needs."""
+        return sum(value.nbytes for value in (*self.head.parameters(), *self.splats.values()))
+
+
+class ViewNoise:
+    """Noise on the camera centre from which the head sees splats in training.
+
+    A head that stores many numbers for each splat can learn every training view by heart, and answers at random between
+    them. A capture whose neighbouring cameras are a distance s apart (`data.views.camera_spacing`) says nothing about
+    changes over less than s. So in training the head, and it alone, sees each splat i from a camera centre of its own,
+
+        o_i = o + e_i,    e_i ~ N(0, sigma^2 I),    sigma = factor * s / sqrt 3,
+
+    drawn anew in each step: e_i is `factor` * s long in the root mean square. The head then learns the mean over views
+    that the capture cannot tell apart. To second order in sigma that is its loss plus sigma^2 / 2 times the square of
+    its slope by o (Bishop, Neural Computation 7, 1995), for each splat on its own: it smooths over the angle
+    sigma / |o - x|, wide for near splats and narrow for far ones, as are the angles between the capture's cameras.
+
+    For a head that looks along o - x_i, moving the camera centre by e_i is moving the mean by -e_i. So the head is
+    given other means, and one camera centre serves all splats.
+
+    The noise depends on the seed and the step alone: a resumed training draws the same as the unbroken one.
+
+    Args:
+        length: root mean square, world units; 0 for no noise.
+        seed: the training's; devices that hold different splats need different ones.
+    """
+
+    def __init__(self, length: float, seed: int):
+        self.sigma, self.seed = length / math.sqrt(3.0), seed
+        self._generators: dict[torch.device, torch.Generator] = {}
+
+    def moved(self, splats: Mapping[str, Tensor], generator: torch.Generator | None) -> Mapping[str, Tensor]:
+        """A table as the head sees it in a training step, with other "means" [N, 3]. None: without noise."""
+        if generator is None:
+            return splats
+        means = splats["means"]
+        noise = torch.randn(means.shape, generator=generator, device=means.device, dtype=means.dtype)
+        return {**splats, "means": torch.add(means, noise, alpha=self.sigma)}
+
+    def generator(self, device: torch.device, step: int) -> torch.Generator | None:
+        """The generator of a step's noise on a device; the same object in each step. None: no noise."""
+        if self.sigma == 0.0:
+            return None
+        if device not in self._generators:
+            self._generators[device] = torch.Generator(device)
+        # Two odd numbers of 64 bits, so that neighbouring steps and seeds are unrelated.
+        key = (self.seed * 0x9E3779B97F4A7C15 + step * 0xBF58476D1CE4E5B9) % 2**63
+        return self._generators[device].manual_seed(key ^ key >> 31)
+
+
 def layers(*widths: int) -> list[nn.Module]:
     """Linear layers between these widths, with leaky ReLUs between them."""
     pairs = [(nn.Linear(*sizes), nn.LeakyReLU()) for sizes in pairwise(widths)]
@@ -174,3 +267,11 @@ def base_opacities(logits: Tensor) -> Tensor:
 def base_colors(features_dc: Tensor) -> Tensor:
     """Base colours [M, 3] from the constant harmonic's coefficients [M, 3]."""
     return 0.5 + SH_C0 * features_dc
+
+
+def unit_vectors(vectors: Tensor, floor: float) -> Tensor:
+    """Vectors v / max(|v|, floor), [..., 3], for finite v and floor > 0; its gradient is at most 1 / floor.
+
+    Spherical harmonics and lobes take the direction from camera to splat, opposite to `nrf.view_geometry`'s.
+    """
+    return vectors / vectors.square().sum(dim=-1, keepdim=True).clamp_min(floor * floor).sqrt()

@@ -2,7 +2,7 @@
 """The neural residual field: one tiny network, shared by the scene, that adds a bounded residual to every splat.
 
 Splat i stores a base colour c, a base opacity alpha and a latent z. Seen from direction d at distance r, with the
-direction's Fourier bands split into low(d) and high(d) (`encoding.py`):
+direction's Fourier bands split into low(d) and high(d):
 
     (dc_low, d_alpha) = low branch (z, c, alpha, log r, low(d))
     (dc_high, w)      = high branch(z, c,        log r, high(d))
@@ -23,6 +23,7 @@ On the logit the residual scales with the opacity: n copies of a splat, each of 
 `fused/` computes the same in two GPU kernels.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple
@@ -30,9 +31,15 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from nrfgs_ns.appearance.encoding import BAND_DIM, NEAREST, fourier_bands, view_geometry
 from nrfgs_ns.appearance.fused import FusedField
-from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig, Component, SplatAppearance, base_colors
+from nrfgs_ns.appearance.head import (
+    NEAREST,
+    AppearanceHead,
+    AppearanceHeadConfig,
+    Component,
+    SplatAppearance,
+    base_colors,
+)
 
 OpacityBound = Literal["straight-through", "logit"]
 OPACITY_BOUNDS: tuple[OpacityBound, ...] = ("straight-through", "logit")
@@ -40,6 +47,10 @@ LOGIT_SLOPE = 4.0
 """One over the sigmoid's slope at half opacity."""
 LATENT_STD = 0.1
 """Standard deviation of the initial latents."""
+FARTHEST = 1e18
+"""Coordinates of v are clamped to this, without gradient beyond: their squares must stay below float32's 3e38."""
+BAND_DIM = 6
+"""Numbers in a band: sin and cos of three coordinates."""
 
 
 @dataclass
@@ -150,7 +161,7 @@ class NeuralResidualField(AppearanceHead):
         return {**super().splat_params(rgb), "latents": latents}
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
-        if self.fused.takes(splats):
+        if self.fused.takes(splats):  # Triton, on CUDA
             return SplatAppearance(*self.fused(splats, visible, camera_centers, self.scene_unit))
         out = self._branches(splats, visible, camera_centers)
         opacities = self._opacity(out).squeeze(-1)
@@ -208,6 +219,36 @@ class NeuralResidualField(AppearanceHead):
         if out.d_alpha is None:
             return torch.sigmoid(out.logit)
         return bounded_opacity(out.logit, torch.tanh(out.d_alpha), self.config.opacity_scale, self.config.bound)
+
+
+def view_geometry(means: Tensor, camera_centers: Tensor, eps: float, unit: float = 1.0) -> tuple[Tensor, Tensor]:
+    """Unit directions from splats to their cameras, and log distances: v / r and log r for v = camera - mean,
+    r = max(|v|, eps). With the camera on the splat its gradient is at most 1 / eps.
+
+    Args:
+        means: [M, 3], world units.
+        camera_centers: [3] or [M, 3], world units.
+        eps: smallest distance, in scene units, > 0; shorter ones count as this.
+        unit: world units in a scene unit.
+
+    Returns:
+        directions [M, 3], shorter than 1 where |v| < eps; logs of the distances in scene units, [M, 1], >= log eps.
+    """
+    v = (camera_centers - means).clamp(-FARTHEST, FARTHEST)
+    r = v.square().sum(dim=-1, keepdim=True).clamp_min((eps * unit) ** 2).sqrt()
+    return v / r, r.log() - math.log(unit)
+
+
+def fourier_bands(directions: Tensor, num_bands: int) -> tuple[Tensor, Tensor]:
+    """Fourier bands of directions [M, 3], K >= 1: band k holds sin(2^k pi d) and cos(2^k pi d).
+
+    Returns:
+        low [M, 9], raw d and band 0; high [M, 6 (K - 1)], the others.
+    """
+    frequencies = math.pi * 2.0 ** torch.arange(num_bands, device=directions.device, dtype=directions.dtype)
+    angles = directions[:, None, :] * frequencies[:, None]  # [M, K, 3]
+    waves = torch.cat([angles.sin(), angles.cos()], dim=-1)  # [M, K, 6]
+    return torch.cat([directions, waves[:, 0]], dim=-1), waves[:, 1:].flatten(1)
 
 
 def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:

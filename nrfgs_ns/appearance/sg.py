@@ -21,8 +21,15 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from nrfgs_ns.appearance.encoding import NEAREST, unit_vectors
-from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig, SplatAppearance, base_colors, base_opacities
+from nrfgs_ns.appearance.head import (
+    NEAREST,
+    AppearanceHead,
+    AppearanceHeadConfig,
+    SplatAppearance,
+    base_colors,
+    base_opacities,
+    unit_vectors,
+)
 
 START_STEP = 2000
 """Training step of the first lobes; before it only the base colour is trained."""

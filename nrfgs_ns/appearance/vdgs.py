@@ -20,9 +20,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from nrfgs_ns.appearance.encoding import NEAREST, unit_vectors
 from nrfgs_ns.appearance.hash_grid import HashGrid, kernels_run_on
-from nrfgs_ns.appearance.head import Component, SplatAppearance, layers
+from nrfgs_ns.appearance.head import NEAREST, Component, SplatAppearance, layers, unit_vectors
 from nrfgs_ns.appearance.sh import ShConfig, SphericalHarmonics, eval_sh
 
 HIDDEN_WIDTH = 32

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.head import Field
 from nrfgs_ns.compact.format import Table
 from nrfgs_ns.compact.tables import COLUMNS, MOST_BITS, Grid, morton, steps_of, tables_of
 from nrfgs_ns.data.checks import warn

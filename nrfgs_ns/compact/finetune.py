@@ -15,14 +15,13 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor, nn
 
-from nrfgs_ns.appearance.field import Field, Sight
-from nrfgs_ns.appearance.head import SplatAppearance
+from nrfgs_ns.appearance.head import Field, Sight, SplatAppearance, ViewNoise
 from nrfgs_ns.appearance.reduce import build, latent_basis, with_components, with_rank
 from nrfgs_ns.compact.rate import Density, Rounded, bits_of_places
 from nrfgs_ns.compact.tables import COLUMNS, MOST_BITS, Grid, morton, splats_of, steps_of, tables_of
+from nrfgs_ns.data.views import camera_spacing
 from nrfgs_ns.model.harmonics_fit import look_through
 from nrfgs_ns.model.loss import photometric
-from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
 
 EVERY = 4
 """Steps between two counts of the bits, which take longer than an image."""

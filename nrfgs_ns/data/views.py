@@ -87,6 +87,28 @@ def distinct_places(centers: Tensor) -> Tensor:
     return centers[_first_of_each(_in_reaches(centers))]
 
 
+NEIGHBOURS = 2
+"""Nearest places to which distances are measured."""
+
+
+def camera_spacing(centers: Tensor) -> float:
+    """The distance between neighbouring training cameras with these centres [V, 3]; 0 if all stand at one place.
+
+    It is the median, weighted by length, of the distances from each place to the two nearest other places. The short
+    distances in pairs and clusters of cameras do not decide it, nor do the long ones of a few cameras far off.
+    """
+    from torch import cdist
+
+    places = distinct_places(centers.double())
+    count = min(NEIGHBOURS, len(places) - 1)
+    if count == 0:
+        return 0.0
+    distances = cdist(places, places, compute_mode="donot_use_mm_for_euclid_dist")
+    nearest = distances.fill_diagonal_(math.inf).topk(count, largest=False).values.flatten().sort().values
+    covered = nearest.cumsum(0)
+    return nearest[int((covered < 0.5 * covered[-1]).sum())].item()
+
+
 def _in_reaches(centers: Tensor) -> np.ndarray:
     """Camera centres [V, 3] about their mean, in distances from there to the farthest."""
     away = centers.double().cpu().numpy()

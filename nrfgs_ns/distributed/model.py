@@ -9,6 +9,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
+from nrfgs_ns.appearance.head import ViewNoise
 from nrfgs_ns.densification import Densification
 from nrfgs_ns.distributed import comm
 from nrfgs_ns.distributed.exchange import send_to_cameras
@@ -17,9 +18,7 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.photograph import PhotographModel
 from nrfgs_ns.model.loss import shrinkage
 from nrfgs_ns.model.model import NrfgsModel
-from nrfgs_ns.model.renderer import Pinhole, View, project_splats, project_view
-from nrfgs_ns.model.view_noise import ViewNoise
-from nrfgs_ns.rasterizer import Projection
+from nrfgs_ns.rasterizer import Pinhole, Projection, View, project, project_view
 from nrfgs_ns.training.pipeline import ShardingConfig
 
 ROWS = "camera_ids", "gaussian_ids", "radii", "means2d", "depths", "n_cameras"
@@ -105,7 +104,8 @@ class ShardedModel(NrfgsModel):
         """This device's splats in all cameras; at once if they have the same size."""
         if len(set(self.sizes)) == 1:
             viewmats, Ks = torch.cat([one.viewmat for one in pinholes]), torch.cat([one.K for one in pinholes])
-            return project_splats(splats, viewmats, Ks, *self.sizes[0], self.projection_options)
+            geometry = splats["means"], splats["quats"], splats["scales"].exp()
+            return project(*geometry, viewmats, Ks, *self.sizes[0], self.projection_options)
         parts = [project_view(splats, one, self.projection_options).projection for one in pinholes]
         for index, part in enumerate(parts):
             part.camera_ids = torch.full_like(part.camera_ids, index)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 import yaml
 
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.head import Field
 from nrfgs_ns.appearance.nrf import NeuralResidualField, NrfConfig
 from nrfgs_ns.appearance.reduce import latent_basis, with_rank
 from nrfgs_ns.compact.decode import TABLES, decode

@@ -18,15 +18,15 @@ import torch
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.head import Field
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, Similarity, to_capture
 from nrfgs_ns.export.options import PlyOptions
 from nrfgs_ns.files import whole
 from nrfgs_ns.model.harmonics_fit import PlainSplats
-from nrfgs_ns.model.renderer import FAR_PLANE, NEAR_PLANE, Pinhole, composite_view, pinhole, project_view
-from nrfgs_ns.rasterizer import ProjectionOptions
+from nrfgs_ns.model.model import pinhole
+from nrfgs_ns.rasterizer import Pinhole, ProjectionOptions, composite_view, project_view
 from nrfgs_ns.threads import few_threads
 from nrfgs_ns.trained.loading import finish, load_model, lost, measure_loss
 
@@ -131,7 +131,8 @@ def render_splats(
 ) -> Tensor:
     """Render a file's splats over a background [3] with this project's rasterizer, [H, W, 3] in [0, 1]."""
     field = Field(ShConfig(degree=3).setup(), splats._asdict())
-    options = ProjectionOptions(rasterize_mode, NEAR_PLANE * scene_unit, FAR_PLANE * scene_unit)
+    planes = (scene_unit * plane for plane in (ProjectionOptions.near_plane, ProjectionOptions.far_plane))
+    options = ProjectionOptions(rasterize_mode, *planes)
     view = project_view(field.splats, _pinhole(camera, splats.means.device), options)
     return composite_view(view, field.seen_from(view), background.to(splats.means.device))[0]["rgb"]
 

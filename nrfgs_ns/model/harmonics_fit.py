@@ -31,12 +31,10 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from nrfgs_ns.appearance.field import Field
-from nrfgs_ns.appearance.head import SplatAppearance, base_colors
+from nrfgs_ns.appearance.head import Field, SplatAppearance, base_colors
 from nrfgs_ns.appearance.sh import num_bases, sh_bases
-from nrfgs_ns.model.renderer import View
 from nrfgs_ns.progress import progress
-from nrfgs_ns.rasterizer import contributions
+from nrfgs_ns.rasterizer import View, contributions
 
 DEGREE = 3
 """Degree of the harmonics in a 3DGS file."""

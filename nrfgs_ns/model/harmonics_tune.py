@@ -13,12 +13,12 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch.nn.functional import pad
 
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.head import Field
 from nrfgs_ns.appearance.sh import ShConfig
+from nrfgs_ns.data.views import camera_spacing
 from nrfgs_ns.model.harmonics_fit import DEGREE, PlainSplats, no_larger
-from nrfgs_ns.model.renderer import View, composite_view
-from nrfgs_ns.model.view_noise import camera_spacing
 from nrfgs_ns.progress import progress
+from nrfgs_ns.rasterizer import View, composite_view
 
 STEPS, STEPS_ON_A_CPU, STEPS_OF_A_VIEW = 2500, 400, 10
 """Steps, of one view each. A GPU takes seconds; a CPU makes STEPS_OF_A_VIEW for each view, at most STEPS_ON_A_CPU."""

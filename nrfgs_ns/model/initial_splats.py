@@ -15,7 +15,7 @@ from torch import Tensor
 from nrfgs_ns.appearance.head import AppearanceHead
 from nrfgs_ns.data.plane_sweep import dense_points, share_kept, small_views
 from nrfgs_ns.model.config import NrfgsModelConfig
-from nrfgs_ns.model.renderer import world_to_camera
+from nrfgs_ns.rasterizer import world_to_camera
 
 OPACITY = 0.1
 ALONE = 0.01

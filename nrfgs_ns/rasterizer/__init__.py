@@ -3,21 +3,26 @@
 
 Two stages, because colours and opacities come from an appearance head that should see visible splats only:
 
-    projection = project(means, quats, scales, viewmats, Ks, width, height)      # which splats, where
-    colors, opacities = head(projection.gaussian_ids, ...)                       # one row per visible splat
-    render, alphas, info = composite(projection, colors, opacities)              # the image
+    view = project_view(field.splats, pinhole, options)            # which splats, and where
+    appearance = field.seen_from(view)                             # colours and opacities, one row per visible splat
+    outputs, info = composite_view(view, appearance, background)   # the image
 
-The device of the means picks the back end: gsplat's kernels on CUDA, `torch_cpu` (plain torch, no compiler) on the CPU.
+`project` and `composite` are the same with gsplat's arguments. The device of the means picks the back end: gsplat's
+kernels on CUDA, `torch_cpu` (plain torch, no compiler) on the CPU.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize, pad
+
+from nrfgs_ns.appearance.head import SplatAppearance
 
 RasterizeMode = Literal["classic", "antialiased"]
 
@@ -29,7 +34,7 @@ TILE_SIZE = 16
 
 @dataclass(frozen=True)
 class ProjectionOptions:
-    """Options of a projection."""
+    """Options of a projection. Its planes are splatfacto's where a scene unit is a world unit."""
 
     rasterize_mode: RasterizeMode = "classic"
     """classic: the blur makes splats wider. antialiased: it also makes them fainter, so that their light is kept"""
@@ -71,16 +76,74 @@ class Projection:
     """Half the sides, in pixels, of the rectangle around each splat; gsplat 1.5's alone. [M, 2], int32"""
 
 
-def _backend(device: torch.device):
-    """The module that projects and composites on a device. Imported late: the CPU path must never load CUDA code."""
+class Pinhole(NamedTuple):
+    """One camera: gsplat's matrices, and its size on the host."""
+
+    viewmat: Tensor
+    """world-to-camera, x right, y down, z forward. [1, 4, 4]"""
+    K: Tensor
+    """intrinsics in pixels. [1, 3, 3]"""
+    width: int
+    """pixels"""
+    height: int
+    """pixels"""
+    center: Tensor
+    """camera centre in world coordinates. [3]"""
+
+    def rays(self) -> Tensor:
+        """Unit directions from the centre through the pixels' centres, in world axes. [H, W, 3]"""
+        x, y, z = self.viewmat[0, :3, :3]  # the camera's axes
+        (fx, _, cx), (_, fy, cy), _ = self.K[0]
+        across = (torch.arange(self.width, device=x.device, dtype=x.dtype) + 0.5 - cx) / fx
+        down = (torch.arange(self.height, device=x.device, dtype=x.dtype) + 0.5 - cy) / fy
+        rays = across[:, None] * x + down[:, None, None] * y + z
+        return normalize(rays, dim=-1)
+
+
+def world_to_camera(camera_to_world: Tensor) -> Tensor:
+    """World-to-camera matrices [C, 4, 4] (OpenCV: y down, z forwards) from poses [C, 3, 4] (OpenGL: y up, z back)."""
+    right, up_and_back, center = camera_to_world[:, :3].split([1, 2, 1], dim=2)
+    rotation = torch.cat([right, -up_and_back], dim=2).transpose(1, 2)
+    matrices = pad(torch.cat([rotation, -rotation @ center], dim=2), (0, 0, 0, 1))
+    matrices[:, 3, 3] = 1.0
+    return matrices
+
+
+class View(NamedTuple):
+    """Splats seen by one camera."""
+
+    projection: Projection
+    """the visible splats on the image plane, M of them"""
+    center: Tensor
+    """camera centre in world coordinates, [3]; of several cameras, each row's, [M, 3]"""
+    every_row: bool = False
+    """invisible splats have rows, too (`ProjectionOptions.every_row`)"""
+    pinhole: Pinhole | None = None
+    """the camera; None: the splats are those of several"""
+
+    @property
+    def visible(self) -> Tensor:
+        """Rows of the table that are visible, int64 [M]."""
+        return self.projection.gaussian_ids
+
+
+def _backend(device: torch.device, stage: str):
+    """The module with a stage, "projection" or "compositing". Imported late: the CPU path must never load CUDA code."""
     if device.type not in ("cuda", "cpu"):
         raise NotImplementedError(f"splats are on device {device}; the rasterizer runs on 'cuda' and 'cpu'")
-    return import_module(f"{__name__}.{'gsplat_cuda' if device.type == 'cuda' else 'torch_cpu'}")
+    return import_module(f"{__name__}.{'gsplat_cuda' if device.type == 'cuda' else f'torch_cpu.{stage}'}")
 
 
 def load_kernels(device: torch.device) -> None:
     """Load a CUDA device's kernels now. A gsplat without compiled kernels compiles them, once, for minutes."""
-    _backend(device).load_kernels(device)
+    _backend(device, "projection").load_kernels(device)
+
+
+def project_view(splats: Mapping[str, Tensor], pinhole: Pinhole, options: ProjectionOptions) -> View:
+    """Project a table of splats ("scales" are logarithms) into one camera."""
+    *camera, center = pinhole
+    projection = project(splats["means"], splats["quats"], splats["scales"].exp(), *camera, options)
+    return View(projection, center, options.every_row, pinhole)
 
 
 def project(
@@ -106,7 +169,58 @@ def project(
         Ks: pinhole intrinsics in pixels, without skew. [C, 3, 3]
         width, height: image size in pixels.
     """
-    return _backend(means.device).project((means, quats, scales), (viewmats, Ks, width, height), options)
+    return _backend(means.device, "projection").project((means, quats, scales), (viewmats, Ks, width, height), options)
+
+
+def composite_view(
+    view: View,
+    appearance: SplatAppearance,
+    background: Tensor,
+    *,
+    with_depth: bool = True,
+    absgrad: bool = False,
+    assume_finite: bool = False,
+    image_of: Callable[[Tensor, Tensor], Tensor] | None = None,
+    look: Callable[[Tensor], Tensor] | None = None,
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Composite the visible splats over a background.
+
+    Args:
+        view: M visible splats.
+        appearance: their colours and opacities.
+        background: a colour [3].
+        with_depth: return depth, too.
+        absgrad, assume_finite: as in `composite`.
+        image_of: of a head at the pixel (`AppearanceHead`). Features are composited over zero, and their image is drawn
+            over the background, as opaque as the splats are. None: colours are the image's.
+        look: the photograph's exposure model, applied to the rendered image [H, W, 3]; None: clamp it to [0, 1].
+
+    Returns:
+        "rgb" [H, W, 3] in [0, 1], "accumulation" [H, W, 1], "background" [H, W, 3], and "depth" [H, W, 1] if wanted;
+        and the rasterizer's `info`, for densification.
+    """
+    render, alpha, info = composite(
+        view.projection,
+        appearance.colors,
+        appearance.opacities,
+        backgrounds=background[None] if image_of is None else None,
+        with_depth=with_depth,
+        absgrad=absgrad,
+        assume_finite=assume_finite,
+    )
+    render, alpha = render.squeeze(0), alpha.squeeze(0)  # the gradient of [0] would be a copy among zeros
+    rgb = render[..., :-1] if with_depth else render
+    if image_of is not None:
+        rgb = alpha * image_of(rgb, view.pinhole.rays()) + (1.0 - alpha) * background
+    outputs = {
+        "rgb": torch.clamp(rgb, 0.0, 1.0) if look is None else look(rgb),
+        "accumulation": alpha,
+        "background": background.expand(*alpha.shape[:2], 3),
+    }
+    if with_depth:
+        depth = render[..., -1:]
+        outputs["depth"] = torch.where(alpha > 0, depth, depth.detach().max())
+    return outputs, info
 
 
 def composite(
@@ -138,7 +252,7 @@ def composite(
         on CUDA also flatten_ids and isect_offsets, the lists of the splats that each tile draws.
     """
     colors, opacities = colors.to(projection.depths.dtype), opacities.to(projection.depths.dtype)
-    backend = _backend(colors.device)
+    backend = _backend(colors.device, "compositing")
     leave_out = not assume_finite and backend.leaves_out(projection, colors, opacities)
     if not assume_finite and not leave_out:
         # One such row would spread over every pixel that it covers, and from there into the gradients of all splats.

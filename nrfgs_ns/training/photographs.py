@@ -21,7 +21,7 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.image import overlap
 from nrfgs_ns.image.overlap import ENOUGH_STOPS, Looks, Pairs, estimate, slope, spread, varies
 from nrfgs_ns.image.photograph import PhotographModel
-from nrfgs_ns.model.renderer import world_to_camera
+from nrfgs_ns.rasterizer import world_to_camera
 
 Exif = dict[str, Any]
 

@@ -22,12 +22,12 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.func import functional_call
 
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.head import Field
 from nrfgs_ns.data.checks import warn
 from nrfgs_ns.densification import memory
 from nrfgs_ns.image.metrics import WINDOW_SIZE
 from nrfgs_ns.model.loss import loss_of
-from nrfgs_ns.model.renderer import Pinhole, composite_view, project_view
+from nrfgs_ns.rasterizer import Pinhole, composite_view, project_view
 
 MORE_ROOM = 1.5
 """Room for pairs of splats and tiles, relative to the view that has most."""

@@ -19,14 +19,12 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.colormaps import apply_float_colormap
 from torch import Tensor
 
-from nrfgs_ns.appearance.field import Field
-from nrfgs_ns.appearance.head import SplatAppearance
+from nrfgs_ns.appearance.head import Field, SplatAppearance
 from nrfgs_ns.image.photograph import exposed
-from nrfgs_ns.rasterizer import composite
+from nrfgs_ns.rasterizer import View, composite
 
 if TYPE_CHECKING:
     from nrfgs_ns.model.model import NrfgsModel
-    from nrfgs_ns.model.renderer import View
 
 FULL, BASE, VIEW_DEPENDENCE, DEPTH = "full", "base colour", "view dependence", "depth"
 
@@ -124,7 +122,7 @@ def picture(
     return outputs
 
 
-def with_gain(field: Field, view: "View", gain: float) -> SplatAppearance:
+def with_gain(field: Field, view: View, gain: float) -> SplatAppearance:
     """The appearance of the visible splats with `gain` times their residual: at 1 the head's own, to the bit; at 0 the
     base appearance."""
     if gain == 1.0:
@@ -149,7 +147,7 @@ def icosahedron() -> Tensor:
     return torch.nn.functional.normalize(torch.tensor(turned), dim=-1)
 
 
-def view_dependence(field: Field, view: "View") -> Tensor:
+def view_dependence(field: Field, view: View) -> Tensor:
     """Standard deviation of the visible splats' colours over 12 directions at the camera's distance: root mean square
     over the channels, in units of white. [M, 1]"""
     means = field.splats["means"].index_select(0, view.visible)
@@ -169,7 +167,7 @@ def scaled_depth(depth: Tensor, accumulation: Tensor) -> Tensor:
     return ((depth - near) / (far - near).clamp_min(1e-10)).clamp(0.0, 1.0)
 
 
-def _blend(view: "View", values: Tensor, opacities: Tensor, accumulation: Tensor) -> Tensor:
+def _blend(view: View, values: Tensor, opacities: Tensor, accumulation: Tensor) -> Tensor:
     """The mean of splats' numbers [M, 1] in each pixel, weighted as their colours are. [H, W, 1]"""
     # Three equal channels: gsplat's kernels have no short cut for one.
     render, _, _ = composite(view.projection, values.expand(-1, 3).contiguous(), opacities)

@@ -4,8 +4,7 @@
 import torch
 from torch.testing import assert_close
 
-from nrfgs_ns.appearance.field import Field
-from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig
+from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig, Field
 
 
 def awake(config: AppearanceHeadConfig, dtype: torch.dtype = torch.float64) -> AppearanceHead:

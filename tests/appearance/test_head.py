@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance import gsnb, vdgs
-from nrfgs_ns.appearance.encoding import view_geometry
 from nrfgs_ns.appearance.gsnb import GsnbConfig
 from nrfgs_ns.appearance.hash_grid import HashGrid
-from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.appearance.nrf import NrfConfig, view_geometry
 from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig

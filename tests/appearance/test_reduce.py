@@ -5,7 +5,7 @@ import pytest
 import torch
 from head_cases import assert_same, random_field
 
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.head import Field
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.reduce import latent_basis, with_rank
 

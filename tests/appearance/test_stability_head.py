@@ -9,8 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nrfgs_ns.appearance.encoding import FARTHEST, fourier_bands, view_geometry
-from nrfgs_ns.appearance.nrf import OPACITY_BOUNDS, NrfConfig, bounded_opacity
+from nrfgs_ns.appearance.nrf import FARTHEST, OPACITY_BOUNDS, NrfConfig, bounded_opacity, fourier_bands, view_geometry
 from nrfgs_ns.appearance.sh import ShConfig
 
 U = 2.0**-24

@@ -19,8 +19,7 @@ from short_trainings import command_line, set_up, trained
 from torch.testing import assert_close
 
 from nrfgs_lab.training_run import evaluate
-from nrfgs_ns.appearance.field import Field
-from nrfgs_ns.appearance.head import base_colors
+from nrfgs_ns.appearance.head import Field, base_colors
 from nrfgs_ns.appearance.reduce import build
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import LARGEST_LOGIT, encode

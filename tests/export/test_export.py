@@ -285,7 +285,7 @@ def test_an_independent_reader_renders_the_models_picture(trained, tmp_path):
     from gsplat.cuda._torch_impl import _spherical_harmonics
     from gsplat_call import rasterization
 
-    from nrfgs_ns.model.renderer import pinhole
+    from nrfgs_ns.model.model import pinhole
 
     config = trained["nrfgs-sh"]
     Ply(config, output=tmp_path / "s.ply", measure=False, options=PlyOptions(world="training")).main()

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.head import Field
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.compact.decode import Decoded, decode
 from nrfgs_ns.compact.encode import encode

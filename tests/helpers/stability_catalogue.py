@@ -23,9 +23,15 @@ from rich.markup import escape
 from rich.table import Table
 from torch import Tensor
 
-from nrfgs_ns.appearance.encoding import fourier_bands, view_geometry
 from nrfgs_ns.appearance.head import base_colors
-from nrfgs_ns.appearance.nrf import OPACITY_BOUNDS, NeuralResidualField, NrfConfig, bounded_opacity
+from nrfgs_ns.appearance.nrf import (
+    OPACITY_BOUNDS,
+    NeuralResidualField,
+    NrfConfig,
+    bounded_opacity,
+    fourier_bands,
+    view_geometry,
+)
 from nrfgs_ns.rasterizer import Projection, ProjectionOptions, project
 from nrfgs_ns.rasterizer.torch_cpu.projection import LARGEST_RADIUS, MIN_QUATERNION
 from nrfgs_ns.training.guard import MAX_GRADIENT

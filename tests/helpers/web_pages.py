@@ -17,7 +17,7 @@ from nerfstudio.cameras.cameras import Cameras
 from PIL import Image
 
 from nrfgs_lab.scenes.cameras import look_at
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.head import Field
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.compact.encode import encode
 from nrfgs_ns.export.web.page import page as page_of

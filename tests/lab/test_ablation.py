@@ -11,9 +11,8 @@ from short_trainings import LOUD, command_line, trained
 from torch.testing import assert_close
 
 from nrfgs_lab import ablation
-from nrfgs_ns.appearance.encoding import view_geometry
-from nrfgs_ns.appearance.field import Field
-from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.appearance.head import Field
+from nrfgs_ns.appearance.nrf import NrfConfig, view_geometry
 from nrfgs_ns.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("no_cuda")

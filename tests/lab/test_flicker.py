@@ -8,7 +8,7 @@ import torch
 from torch.testing import assert_close
 
 from nrfgs_lab.flicker import flicker, warped
-from nrfgs_ns.model.renderer import Pinhole, world_to_camera
+from nrfgs_ns.rasterizer import Pinhole, world_to_camera
 
 K = torch.tensor([[[20.0, 0, 8.0], [0, 20.0, 6.0], [0, 0, 1]]])
 

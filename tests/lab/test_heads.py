@@ -11,11 +11,10 @@ from short_trainings import command_line, trained
 from nrfgs_lab.heads.deferred import DeferredConfig
 from nrfgs_lab.heads.latent_spec import LatentSpecConfig
 from nrfgs_lab.training_run import evaluate
-from nrfgs_ns.appearance.field import Field
+from nrfgs_ns.appearance.head import Field
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Compact, Ply, Web
-from nrfgs_ns.model.renderer import Pinhole, composite_view, project_view, world_to_camera
-from nrfgs_ns.rasterizer import ProjectionOptions
+from nrfgs_ns.rasterizer import Pinhole, ProjectionOptions, composite_view, project_view, world_to_camera
 from nrfgs_ns.viewer.pictures import BASE, DEPTH, FULL, PictureOptions, legends, picture
 
 pytestmark = pytest.mark.usefixtures("no_cuda")

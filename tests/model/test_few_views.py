@@ -11,9 +11,9 @@ from short_trainings import REFINING, checkpoint_of, command_line, models_of, se
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.data.views import camera_spacing
 from nrfgs_ns.densification import ErrorGuided, Mcmc, Splatfacto
 from nrfgs_ns.model.loss import shrinkage
-from nrfgs_ns.model.view_noise import camera_spacing
 
 
 def ready(scene, out, steps, *options):

@@ -15,14 +15,12 @@ from pytorch_msssim import SSIM
 from short_trainings import untrained
 from torch.testing import assert_close
 
-from nrfgs_ns.appearance.field import Field
-from nrfgs_ns.appearance.head import SplatAppearance
+from nrfgs_ns.appearance.head import Field, SplatAppearance
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.model.model import NrfgsModel
-from nrfgs_ns.model.renderer import Pinhole, Pinholes, composite_view, pinhole, project_view, world_to_camera
+from nrfgs_ns.model.model import NrfgsModel, Pinholes, pinhole
 from nrfgs_ns.model.warmup import warm_up
-from nrfgs_ns.rasterizer import ProjectionOptions, composite
+from nrfgs_ns.rasterizer import Pinhole, ProjectionOptions, composite, composite_view, project_view, world_to_camera
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 

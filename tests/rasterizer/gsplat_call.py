@@ -11,7 +11,8 @@ from make_gsplat_fixtures import Case
 from torch import Tensor
 from torch.testing import assert_close
 
-from nrfgs_ns.rasterizer import Projection, ProjectionOptions, composite, project, torch_cpu
+from nrfgs_ns.rasterizer import Projection, ProjectionOptions, composite, project
+from nrfgs_ns.rasterizer.torch_cpu import compositing
 
 
 def rasterization(
@@ -76,7 +77,7 @@ def draw_with_our_kernels(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
     """Composite what the CPU has projected by our kernels on a device, and never by gsplat's."""
     from nrfgs_ns.rasterizer import gsplat_cuda
 
-    usual = torch_cpu.composite
+    usual = compositing.composite
 
     def composite(projection: Projection, colors: Tensor, opacities: Tensor, backgrounds: Tensor | None, *how: bool):
         if len(opacities) == 0:
@@ -97,7 +98,7 @@ def draw_with_our_kernels(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
     monkeypatch.setattr(gsplat_cuda, "_gsplats_image", Mock(side_effect=Theirs))
     for name in ("_kernels_run_on", "_compositing_runs_on"):
         monkeypatch.setattr(gsplat_cuda, name, lambda _: True)
-    monkeypatch.setattr(torch_cpu, "composite", composite)
+    monkeypatch.setattr(compositing, "composite", composite)
 
 
 def for_our_kernels(case: Case) -> Case:

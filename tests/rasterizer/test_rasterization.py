@@ -13,7 +13,7 @@ from make_gsplat_fixtures import CASES, _camera
 from tile_list_cases import Splats, assert_lists, splats
 
 from nrfgs_ns.rasterizer import TILE_SIZE, ProjectionOptions, composite, project
-from nrfgs_ns.rasterizer.torch_cpu import batches, compositing
+from nrfgs_ns.rasterizer.torch_cpu import compositing
 from nrfgs_ns.rasterizer.torch_cpu.tiles import SUB_TILE, footprints, list_tiles
 
 
@@ -96,7 +96,7 @@ def test_hidden_splats_cost_nothing(monkeypatch):
     means, K = in_a_row(n)
     shape = [torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(n, 1), torch.full((n, 3), 10.0)]
     rasterization(means, *shape, torch.full((n,), 0.9), torch.ones(n, 1), torch.eye(4)[None], K, 8, 8)
-    assert looked_at == [(1, batches.SLAB)]  # tiles, splats
+    assert looked_at == [(1, compositing.SLAB)]  # tiles, splats
 
 
 PEAK = """

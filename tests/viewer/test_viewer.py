@@ -22,14 +22,13 @@ from torch.testing import assert_close
 from viser.infra import _infra
 
 from nrfgs_lab.scenes import SceneConfig, write_scene
-from nrfgs_ns.appearance.field import Field
-from nrfgs_ns.appearance.head import SplatAppearance
+from nrfgs_ns.appearance.head import Field, SplatAppearance
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.data.datamanager import NrfgsInputDataset
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.image.photograph import BASIS, exposed
-from nrfgs_ns.model.renderer import View
+from nrfgs_ns.rasterizer import View
 from nrfgs_ns.viewer import pictures as drawn
 from nrfgs_ns.viewer import start
 from nrfgs_ns.viewer.pictures import BASE, DEPTH, FULL, VIEW_DEPENDENCE, PictureOptions, legends, picture

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from short_trainings import REFINING, command_line, set_up
 
-from nrfgs_ns.data.views import distinct_places
-from nrfgs_ns.model.view_noise import ViewNoise, camera_spacing
+from nrfgs_ns.appearance.head import ViewNoise
+from nrfgs_ns.data.views import camera_spacing, distinct_places
 
 
 def ring(count: int, radius: float = 1.0) -> torch.Tensor:
