@@ -2,6 +2,7 @@
 """`nrfgs doctor`: what is missing is named with its fix, and the status says whether training works."""
 
 import contextlib
+import sys
 from importlib.metadata import PackageNotFoundError
 from unittest.mock import Mock
 
@@ -70,11 +71,16 @@ def test_what_training_works_without(name, found, works, installed, capsys):
     assert doctor.imports.called == doctor.machine.called == works, "they import what is missing"
 
 
-def test_what_cannot_be_imported_is_told(monkeypatch):
+def test_what_cannot_be_imported_is_told(tmp_path, monkeypatch):
+    """Also a method of another package, without which no command of nerfstudio's starts."""
     assert not doctor.imports()[0].broken
-    monkeypatch.setattr(doctor.importlib, "import_module", Mock(side_effect=OSError("libGL.so.1: cannot open")))
+    (tmp_path / "mine-1.dist-info").mkdir()
+    (tmp_path / "mine-1.dist-info" / "entry_points.txt").write_text("[nerfstudio.method_configs]\nmine = mine:mine\n")
+    (tmp_path / "mine.py").write_text("import no_such_library")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "nerfstudio.configs.method_configs")
     (finding,) = doctor.imports()
-    assert finding.broken and finding.fix and "libGL.so.1" in finding.state
+    assert finding.broken and finding.fix and "'no_such_library', in" in finding.state and "mine.py" in finding.state
 
 
 def test_kernels_that_fail_are_told_apart(monkeypatch):

@@ -11,6 +11,7 @@ import yaml
 
 from nrfgs_ns import method_config
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.training import config_file
 from nrfgs_ns.training.config_file import read_config
 
 
@@ -88,6 +89,15 @@ def test_a_file_that_asks_for_more_is_refused(read, tmp_path, text):
     assert "\n" not in str(refused.value) and not mark.exists()
     if "touch" in text:  # the file is one that would have been obeyed, or would have failed for another reason
         assert "it asks for" in str(refused.value) or "could not determine a constructor" in str(refused.value)
+
+
+def test_a_package_that_cannot_be_imported_is_told(read, tmp_path, monkeypatch):
+    (tmp_path / "my_head.py").write_text("import no_such_library")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(config_file, "_plugins", lambda: {"my_head", "nrfgs_ns"})
+    text = WHOLE.replace("nrfgs_ns.appearance.nrf.NrfConfig", "my_head.LinearConfig")
+    with pytest.raises(InputError, match="my_head.LinearConfig.*missing or broken .*No module named 'no_such_library'"):
+        read(text)
 
 
 TYPES = {

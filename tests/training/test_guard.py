@@ -140,6 +140,7 @@ def test_large_gradients_that_adam_can_square_pass(start):
     assert torch.isfinite(moments).all() and moments.max() > 1e33
 
 
+@pytest.mark.filterwarnings("error:Converting a tensor")
 @pytest.mark.parametrize(
     ("name", "cause"),
     [("loss", r"the image or mask is broken: .*view_\d+.png"), ("scales", "Lower --optimizers.scales.optimizer.lr")],
