@@ -85,7 +85,7 @@ class AppearanceHead(nn.Module, ABC):
     name: str
     """Short name, written into checkpoints."""
     config: AppearanceHeadConfig
-    """The configuration that built it."""
+    """The configuration that has set it up."""
     sh_degree: int = 0
     """Degree of the spherical harmonics among the splats' parameters; 0 if there are none."""
     scene_unit: float = 1.0
@@ -95,6 +95,9 @@ class AppearanceHead(nn.Module, ABC):
     at_pixel: bool = False
     """Whether `colors` are features [M, D], any D, which `image_of` turns into an image once composited. Such a
     head needs no `features_dc`, its `base_appearance` is in features, too, and rays are the camera's, without noise."""
+
+    def __init__(self, config: AppearanceHeadConfig | None = None):
+        super().__init__()  # `setup` gives it the configuration
 
     def splat_params(self, rgb: Tensor) -> dict[str, Tensor]:
         """Initial per-splat tensors [N, ...] by name, on rgb's device, for base colours rgb [N, 3] in [0, 1].
