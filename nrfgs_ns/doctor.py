@@ -7,6 +7,7 @@ import platform
 import sys
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
+from traceback import extract_tb
 
 from packaging.requirements import Requirement
 
@@ -50,12 +51,14 @@ def packages() -> list[Finding]:
 
 
 def imports() -> list[Finding]:
-    """Whether what `ns-train nrfgs` needs can be imported: libraries of the system may be missing."""
+    """Whether what `ns-train nrfgs` needs can be imported: libraries of the system may be missing, and one package that
+    registers a method and cannot be imported takes all methods along."""
     try:
-        importlib.import_module("nrfgs_ns.method_config")
+        importlib.import_module("nerfstudio.configs.method_configs")
     except Exception as error:
         fix = "Install what it names; docs/troubleshooting.md has the common cases."
-        return [Finding("ns-train nrfgs", f"cannot be imported ({type(error).__name__}: {error})", fix, True)]
+        where = f"{type(error).__name__}: {error}, in {extract_tb(error.__traceback__)[-1].filename}"
+        return [Finding("ns-train nrfgs", f"cannot be imported ({where})", fix, True)]
     return [Finding("ns-train nrfgs", "can be imported")]
 
 

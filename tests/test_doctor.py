@@ -2,6 +2,7 @@
 """`nrfgs doctor`: what is missing is named with its fix, and the status says whether training works."""
 
 import contextlib
+import sys
 from importlib.metadata import PackageNotFoundError
 from unittest.mock import Mock
 
@@ -72,9 +73,10 @@ def test_what_training_works_without(name, found, works, installed, capsys):
 
 def test_what_cannot_be_imported_is_told(monkeypatch):
     assert not doctor.imports()[0].broken
-    monkeypatch.setattr(doctor.importlib, "import_module", Mock(side_effect=OSError("libGL.so.1: cannot open")))
+    monkeypatch.setattr("nerfstudio.plugins.registry.entry_points", Mock(side_effect=OSError("libGL.so.1: missing")))
+    monkeypatch.delitem(sys.modules, "nerfstudio.configs.method_configs")
     (finding,) = doctor.imports()
-    assert finding.broken and finding.fix and "libGL.so.1" in finding.state
+    assert finding.broken and finding.fix and "libGL.so.1: missing, in /" in finding.state
 
 
 def test_kernels_that_fail_are_told_apart(monkeypatch):
@@ -99,10 +101,9 @@ def test_all_kernels_run_on_this_gpu():
 
 
 def test_a_gpu_is_named_with_its_memory(monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
-    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "H100")
-    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (12e9, 80e9))
+    told = {"is_available": True, "current_device": 0, "get_device_name": "H100", "mem_get_info": (12e9, 80e9)}
+    for name, value in told.items():
+        monkeypatch.setattr(torch.cuda, name, Mock(return_value=value))
     monkeypatch.setattr(doctor, "kernels", lambda device: [doctor.Finding("kernels", str(device))])
     gpu, kernels = [finding for finding in doctor.machine() if finding.name != "LPIPS"]
     assert all(part in gpu.state for part in ("H100", "12.0", "80.0")) and not gpu.fix and kernels.state == "cuda:0"

@@ -92,9 +92,16 @@ class Bench:
         if pending:
             from nerfstudio.configs.method_configs import all_methods  # takes seconds
 
-            for run in dict.fromkeys(cell.run for cell in chosen):
-                if run.method not in all_methods:
-                    raise InputError(f"{self.spec}: runs: {run.name}: {run.method!r} is no method of ns-train.")
+            from nrfgs_lab.training_run import parse
+
+            for job in pending.values():
+                where = f"{self.spec}: runs: {job.cell['run']}"
+                if job.args[0] not in all_methods:
+                    raise InputError(f"{where}: {job.args[0]!r} is no method of ns-train.")
+                try:
+                    parse(job.args)
+                except SystemExit:  # its reason is on the terminal
+                    raise InputError(f"{where}: ns-train refuses the options, as told above. Correct them.") from None
             # A terminated benchmark must not leave its children behind; an exception reaches the `finally` below.
             signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
             self.run_all(pending, plan)
@@ -158,9 +165,7 @@ class Bench:
                 steps=steps_of(plan, cell.run, cell.scene),
                 record=str(self.record(cell.name)),
                 work=str(self.work / cell.name),
-                train_views=plan.train_views,
-                jobs=plan.jobs,
-                quick=plan.quick,
+                **{name: getattr(plan, name) for name in ("train_views", "jobs", "quick")},
             )
             for cell in cells
         }

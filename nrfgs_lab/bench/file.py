@@ -108,6 +108,8 @@ def make_spec(content: dict[str, Any], where: str) -> Spec:
 
 def _check_run(run: Method, spec: Spec, where: str) -> None:
     _require_free(run.options, SET_HERE, f"{where}: options")
+    unknown = set(run.scenes) - {name for scene in spec.scenes for name in (scene.name, scene.path)}
+    _require(not unknown, f"{where}: scenes: the plan has no {', '.join(sorted(unknown))}. Name some that it has.")
     for strategy in strategies_of(run, spec):
         options = strategy_options(strategy)
         given = dict.fromkeys(options, f"strategy {strategy} gives it; use strategy own")

@@ -177,6 +177,9 @@ def notes(rows: list[Row]) -> list[str]:
     thin = [one.name for one in COLUMNS if any(0 < len(row.values[one.name]) < len(row.records) for row in rows)]
     if thin:
         result.append(f"Some numbers rest on fewer seeds than their row, on those that have them: {', '.join(thin)}.")
+    budgets = [(row, re.search(r"(?:@|\bbudget=)(\d+)", row.strategy)) for row in rows]
+    if over := [row.run for row, most in budgets if most and (row.mean(BY_NAME["splats"]) or 0) > int(most[1])]:
+        result.append(f"More splats than the budget, since they began with more: {', '.join(dict.fromkeys(over))}.")
     timed = [row.devices for row in rows if any(row.values[column.name] for column in COLUMNS if column.is_time)]
     if len(set().union(*timed)) > 1:
         result.append("Times and FPS were taken on different machines; none is marked beside those of another.")

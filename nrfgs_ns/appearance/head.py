@@ -9,8 +9,11 @@ A field is a head and the table of splats that it draws; in training the head se
 """
 
 import math
+import os
+import traceback
 from abc import ABC, abstractmethod
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Literal, NamedTuple, Protocol
@@ -54,7 +57,7 @@ class AppearanceHeadConfig:
         """Build the head, or raise InputError if a field is out of range; `scene_unit`: world units in a scene unit."""
         self.validate()
         head = self._target(self)
-        head.scene_unit = scene_unit
+        head.config, head.scene_unit = self, scene_unit
         return head
 
     def validate(self) -> None:
@@ -86,6 +89,8 @@ class AppearanceHead(nn.Module, ABC):
 
     name: str
     """Short name, written into checkpoints."""
+    config: AppearanceHeadConfig
+    """The configuration that has set it up."""
     sh_degree: int = 0
     """Degree of the spherical harmonics among the splats' parameters; 0 if there are none."""
     scene_unit: float = 1.0
@@ -95,6 +100,9 @@ class AppearanceHead(nn.Module, ABC):
     at_pixel: bool = False
     """Whether `colors` are features [M, D], any D, which `image_of` turns into an image once composited. Such a
     head needs no `features_dc`, its `base_appearance` is in features, too, and rays are the camera's, without noise."""
+
+    def __init__(self, config: AppearanceHeadConfig | None = None):
+        super().__init__()  # `setup` gives it the configuration
 
     def splat_params(self, rgb: Tensor) -> dict[str, Tensor]:
         """Initial per-splat tensors [N, ...] by name, on rgb's device, for base colours rgb [N, 3] in [0, 1].
@@ -251,6 +259,52 @@ class ViewNoise:
         # Two odd numbers of 64 bits, so that neighbouring steps and seeds are unrelated.
         key = (self.seed * 0x9E3779B97F4A7C15 + step * 0xBF58476D1CE4E5B9) % 2**63
         return self._generators[device].manual_seed(key ^ key >> 31)
+
+
+@contextmanager
+def failures_told(config: AppearanceHeadConfig) -> Iterator[None]:
+    """Turn an exception of a head's code, which may be anybody's, into an InputError with its place."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        last = [frame for frame in frames if f"{os.sep}torch{os.sep}" not in frame.filename][-1]
+        raise InputError(
+            f"The head of {type(config).__name__} fails: {type(error).__name__}: {error} ({last.filename}, line "
+            f"{last.lineno}). What it stores of a splat, splat_params must return. NRFGS_DEBUG=1 shows the traceback."
+        ) from error
+
+
+@torch.no_grad()
+def check_head(head: AppearanceHead, splats: Mapping[str, Tensor]) -> None:
+    """Raise InputError where a head breaks its contract. It is asked about one of its initial splats, in two rows
+    beyond the table's end: a table of the head's own would miss the splats that densification adds."""
+    whose, count = f"{type(head).__module__}.{type(head).__name__}", len(splats["means"])
+
+    def require(what: str, value: Tensor, *shape: int) -> None:
+        if value.dtype != torch.float32 or value.shape != shape or not value.isfinite().all():
+            found = f"{str(value.dtype).removeprefix('torch.')} {[*value.shape]}"
+            found += "" if value.isfinite().all() else ", not all finite"
+            raise InputError(f"{whose}: {what} must be finite float32 {[*shape]}, but is {found}. Correct it there.")
+
+    if not isinstance(getattr(head, "name", None), str):
+        raise InputError(f'{whose} has no name, which checkpoints need. Give the class one, such as name = "mine".')
+    for name, value in splats.items():
+        require(f"{name!r} of splat_params", value, count, *value.shape[1:])
+    if count == 0:
+        return
+    table = {name: value[:1].expand(count + 2, *value.shape[1:]) for name, value in splats.items()}
+    answer = head(table, torch.arange(count, count + 2), splats["means"][0] + head.scene_unit)
+    if not isinstance(answer, SplatAppearance):
+        kind = type(answer).__name__
+        raise InputError(f"{whose}: forward returns a {kind}. Let it return SplatAppearance(colors, opacities).")
+    require("opacities of forward, for two splats,", answer.opacities, 2)
+    require("colors of forward, for two splats,", answer.colors, 2, answer.colors.shape[-1] if head.at_pixel else 3)
+    if head.at_pixel:
+        rays = torch.tensor([[[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]])
+        require("what image_of makes of two pixels", head.image_of(answer.colors[None], rays), 1, 2, 3)
 
 
 def layers(*widths: int) -> list[nn.Module]:

@@ -21,7 +21,14 @@ from nerfstudio.utils.colors import get_color
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
-from nrfgs_ns.appearance.head import AppearanceHeadConfig, Field, SplatAppearance, ViewNoise
+from nrfgs_ns.appearance.head import (
+    AppearanceHeadConfig,
+    Field,
+    SplatAppearance,
+    ViewNoise,
+    check_head,
+    failures_told,
+)
 from nrfgs_ns.data.checks import warn
 from nrfgs_ns.data.views import camera_spacing
 from nrfgs_ns.densification import Densification
@@ -74,10 +81,13 @@ class NrfgsModel(ExportedModel):
         self.near: float = NEAR_SHARE * metadata.get("nearest_depth", 0.0)
         """Depth from which `near_plane` auto draws splats, in world units; a checkpoint keeps its training's."""
         config.appearance.validate()
-        self.head = config.suited_appearance(self.num_views).setup(self.scene_unit)
-        config.sh_degree = self.head.sh_degree
         self._seed = torch.initial_seed()
-        self.gauss_params = ParameterDict(self._initial_splats())
+        with failures_told(config.appearance):
+            self.head = config.suited_appearance(self.num_views).setup(self.scene_unit)
+            splats = self._initial_splats()
+            check_head(self.head, splats)
+        config.sh_degree = self.head.sh_degree
+        self.gauss_params = ParameterDict(splats)
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
         self.photograph: PhotographModel | None = None  # set by the pipeline, which knows the photographs
         self.trimming = robust.Trimming(config.robust_loss) if config.robust_loss > 0.0 else None

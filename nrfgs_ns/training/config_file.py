@@ -105,12 +105,12 @@ class _Loader(yaml.SafeLoader):
     """YAML's plain types, and the tags that the module's docstring lists."""
 
 
-def _refuse(node: yaml.Node, name: str) -> yaml.YAMLError:
-    return yaml.constructor.ConstructorError(
-        problem=f"it asks for {name!r}, which is no option of nerfstudio, nrfgs_ns or a package that registers "
-        "methods. If you trust the file, nerfstudio's own commands read it",
-        problem_mark=node.start_mark,
-    )
+def _refuse(node: yaml.Node, name: str, failure: Exception | None = None) -> yaml.YAMLError:
+    why = "which is no option of nerfstudio, nrfgs_ns or an installed package that registers methods (nerfstudio's own "
+    why += "commands read a file that you trust)"
+    if failure is not None:
+        why = f"whose package is missing or broken ({type(failure).__name__}: {failure})"
+    return yaml.constructor.ConstructorError(problem=f"it asks for {name!r}, {why}", problem_mark=node.start_mark)
 
 
 def _class(loader: _Loader, name: str, node: yaml.Node) -> type:
@@ -118,8 +118,8 @@ def _class(loader: _Loader, name: str, node: yaml.Node) -> type:
     module, _, attribute = name.rpartition(".")
     try:
         kind = getattr(importlib.import_module(module), attribute) if _is_known(name) else None
-    except Exception:  # whatever importing it leads to
-        kind = None
+    except Exception as failure:  # whatever importing it leads to
+        raise _refuse(node, name, failure) from failure
     if not isinstance(kind, type) or not _is_known(kind.__module__):
         raise _refuse(node, name)
     return kind

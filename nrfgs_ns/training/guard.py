@@ -237,7 +237,7 @@ def _cause(model, names: list[str], image: object) -> str:
     if "loss main_loss" in names and "the rendered image" not in names:
         return f"the rendering is finite and its loss is not, so the image or mask is broken: {image}. Replace it."
     for group, value in (*model.gauss_params.items(), *(("field", weight) for weight in model.head.parameters())):
-        if value.numel() and not (reached := float(value.abs().max())) <= HUGE.get(group, HUGE_OTHERWISE):  # or NaN
+        if value.numel() and not (reached := value.abs().max().item()) <= HUGE.get(group, HUGE_OTHERWISE):  # or NaN
             return (
                 f"a learning rate that is too high: {group} have reached {reached:.2g}. Lower "
                 f"--optimizers.{group}.optimizer.lr and start from an older checkpoint."

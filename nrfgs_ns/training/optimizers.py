@@ -17,6 +17,7 @@ from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
+from nrfgs_ns.errors import InputError
 from nrfgs_ns.kernels.trial import tried_once
 from nrfgs_ns.training.pace import Pace
 
@@ -30,6 +31,11 @@ class LeanOptimizers(Optimizers):
     """
 
     def __init__(self, config, param_groups, steps_per_log: int = 10, pace: Pace | None = None):
+        if missing := sorted(param_groups.keys() - config.keys()):
+            raise InputError(
+                f"The method has no optimizer for its head's {', '.join(missing)}. Register it with "
+                f"{missing[0]}=adam(LEARNING_RATE), as in docs/contributing.md."
+            )
         super().__init__(config, param_groups)
         self.steps_per_log = steps_per_log
         self.pace = pace

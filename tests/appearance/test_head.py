@@ -11,10 +11,13 @@ from torch.testing import assert_close
 from nrfgs_ns.appearance import gsnb, vdgs
 from nrfgs_ns.appearance.gsnb import GsnbConfig
 from nrfgs_ns.appearance.hash_grid import HashGrid
+from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig, SplatAppearance
 from nrfgs_ns.appearance.nrf import NrfConfig, view_geometry
 from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.appearance.vdgs import VdgsConfig
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.model.config import NrfgsModelConfig
 
 CONFIGS = {"nrf": NrfConfig(), "sh": ShConfig(), "vdgs": VdgsConfig(), "gsnb": GsnbConfig(), "sg": SgConfig()}
 SMALL = {
@@ -130,6 +133,38 @@ def test_one_camera_is_as_good_as_one_for_each_splat(config):
     one = head(splats, visible, centers[0])
     each = head(splats, visible, centers[:1].expand(len(visible), 3))
     assert torch.equal(one.colors, each.colors) and torch.equal(one.opacities, each.opacities)
+
+
+class Mine(AppearanceHead):
+    name = "mine"
+
+    def __init__(self, config):
+        super().__init__()
+
+    def forward(self, splats, visible, camera_centers, change=lambda *answer: answer):
+        return SplatAppearance(*change(*self.base_appearance(splats, visible)))
+
+
+def answering(change):
+    return {"forward": lambda *inputs: Mine.forward(*inputs, change)}
+
+
+@pytest.mark.parametrize("change, says", [
+    ({"name": None}, "Mine has no name"),
+    ({"splat_params": lambda self, rgb: {"x": rgb[1:]}}, r"'x' of splat_params must be .*\[5, 3\], but .*\[4, 3\]"),
+    ({"splat_params": lambda self, rgb: {"x": rgb.long()}}, "'x' of splat_params .* int64"),
+    ({"forward": lambda self, splats, *_: splats["slopes"]}, r"KeyError: 'slopes' \(.*test_head.py, line \d+\)"),
+    ({"forward": lambda self, splats, visible, _: torch.zeros(5)[visible]}, "IndexError: .*splat_params must return"),
+    ({"forward": lambda self, *_: (1, 2)}, "returns a tuple"),
+    (answering(lambda colors, opacities: (colors, opacities[:, None])), r"opacities .*\[2\], but .*\[2, 1\]"),
+    (answering(lambda colors, opacities: (colors.half(), opacities)), "colors .*float16"),
+    (answering(lambda colors, opacities: (colors / 0, opacities)), "colors .*not all finite"),
+    ({"at_pixel": True, "image_of": lambda self, features, rays: features[..., :2]}, r"image_of .*\[1, 2, 2\]"),
+])  # fmt: skip
+def test_a_head_that_breaks_the_contract_is_told_before_the_training(change, says):
+    config = NrfgsModelConfig(appearance=AppearanceHeadConfig(_target=type("Mine", (Mine,), change)))
+    with pytest.raises(InputError, match=says):
+        config.setup(scene_box=None, num_train_data=1, seed_points=(torch.rand(5, 3), torch.full((5, 3), 100)))
 
 
 coordinate = st.floats(-1e6, 1e6, allow_nan=False, width=32)

@@ -112,9 +112,7 @@ def random_scene(folder: Path, mode: str, options: dict) -> tuple[Path, list[dic
         "features_dc": torch.randn(count, 3),
     }
     # The third is inside: splats behind the camera, across it, and beyond the picture's edges.
-    eyes = [
-        [3 * math.cos(2.1 * k) * near, 3 * math.sin(2.1 * k) * near, 0.8 * near] for k, near in enumerate((1, 1, 0.2))
-    ]
+    eyes = [[3 * math.cos(2.1 * k) * r, 3 * math.sin(2.1 * k) * r, 0.8 * r] for k, r in enumerate((1, 1, 0.2))]
     return written(folder, splats, mode, options), [photograph(str(k), eye) for k, eye in enumerate(eyes)]
 
 

@@ -13,6 +13,8 @@ from nrfgs_ns import method_config
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training.config_file import read_config
 
+WHOLE = yaml.dump(method_config.nrfgs.config)
+
 
 @pytest.fixture
 def read(tmp_path):
@@ -30,18 +32,14 @@ def test_what_is_saved_is_read_back(read, name):
 
 
 def test_enums_as_early_versions_of_python_3_11_write_them(read):
-    event = r"!!python/object/apply:nerfstudio.utils.writer.EventName\n(\s*)- Train Iter \(time\)"
-    text, count = re.subn(
-        event,
-        r"!!python/object/apply:builtins.getattr\n\1- !!python/name:nerfstudio.utils.writer.EventName ''"
-        r"\n\1- ITER_TRAIN_TIME",
-        yaml.dump(method_config.nrfgs.config),
-    )
+    kind = "nerfstudio.utils.writer.EventName"
+    event = rf"!!python/object/apply:{kind}\n(\s*)- Train Iter \(time\)"
+    early = rf"!!python/object/apply:builtins.getattr\n\1- !!python/name:{kind} ''\n\1- ITER_TRAIN_TIME"
+    text, count = re.subn(event, early, WHOLE)
     assert count == 1 or sys.version_info < (3, 11, 4)
     assert read(text) == method_config.nrfgs.config
 
 
-WHOLE = yaml.dump(method_config.nrfgs.config)
 CALL = "!!python/object/apply:os.system ['touch {mark}']"
 NAME = "!!python/name:nerfstudio"
 
@@ -60,9 +58,7 @@ HOSTILE = {
     "a module of a package": "!!python/object/apply:nerfstudio.scripts.train.os.system ['touch {mark}']",
     "a module": "!!python/module:os",
     "a function as target": WHOLE.replace("name:nrfgs_ns.training.trainer.NrfgsTrainer ''", "name:os.system ''"),
-    "another class as target": WHOLE.replace(
-        "!!python/name:torch.optim.adam.Adam ''", f"{NAME}.utils.writer.TensorboardWriter ''", 1
-    ),
+    "another class": WHOLE.replace("name:torch.optim.adam.Adam", "name:nerfstudio.utils.writer.TensorboardWriter", 1),
     "a method of a configuration": with_project("setup: !!python/name:torch.optim.adam.Adam ''"),
     "an object that is no configuration": "!!python/object:nerfstudio.engine.trainer.Trainer {}",
     "an object of another package": "!!python/object:subprocess.Popen {}",
@@ -74,6 +70,7 @@ HOSTILE = {
     "an attribute of a class": "!!python/object/apply:builtins.getattr "
     f"[{NAME}.engine.trainer.TrainerConfig '', setup]",
     "an attribute of an enum": f"!!python/object/apply:builtins.getattr [{NAME}.utils.writer.EventName '', __class__]",
+    "a class that is gone": WHOLE.replace("nrf.NrfConfig", "gone.NrfConfig"),
     "a value that the enum lacks": "!!python/object/apply:nerfstudio.utils.writer.EventName ['no such']",
 }
 
@@ -86,6 +83,7 @@ def test_a_file_that_asks_for_more_is_refused(read, tmp_path, text):
     with pytest.raises(InputError, match="config.yml is not") as refused:
         read(text)
     assert "\n" not in str(refused.value) and not mark.exists()
+    assert "gone" not in text or "package is missing or broken (ModuleNotFoundError: No" in str(refused.value)
     if "touch" in text:  # the file is one that would have been obeyed, or would have failed for another reason
         assert "it asks for" in str(refused.value) or "could not determine a constructor" in str(refused.value)
 

@@ -184,9 +184,7 @@ def test_what_is_left_open_is_chosen_and_what_is_given_stays():
     assert chosen(time_budget=2.0) == (30_000, 30_000, 200)
 
 
-def test_the_chosen_steps_are_made_and_a_training_goes_on_to_their_end(
-    tiny_scene, tmp_path, no_cuda, capsys, monkeypatch
-):
+def test_chosen_steps_are_made_and_resuming_goes_on_to_their_end(tiny_scene, tmp_path, no_cuda, capsys, monkeypatch):
     """The rule in miniature: 12 steps for the tiny scene's 8 views, of schedules for 30."""
     monkeypatch.setattr(pace, "STEPS_PER_VIEW", 1)
     for module in (pace, trainer_config):

@@ -25,8 +25,7 @@ name, here = Path(job["record"]).stem, Path(__file__).parent
 behaviours = json.loads((here / "behaviour.json").read_text())
 behaviour = behaviours.get(name, behaviours.get("all", "good"))
 Path(job["work"]).mkdir(parents=True, exist_ok=True)
-if behaviour == "fails":
-    sys.exit(3)
+if behaviour == "fails": sys.exit(3)
 if behaviour == "hangs":
     (Path(job["work"]) / "pid").write_text(str(os.getpid()))
     time.sleep(600)
@@ -42,8 +41,7 @@ record = {
     "train": {"seconds": 10.0, "parts": 1, "splats": [[0, 10], [100, 20]]},
     "measured": {"test": metrics, "train": None, "fps": 5.0, "splats": 20, "parameter_bytes": 1, "checkpoint_bytes": 2},
 }
-if behaviour != "silent":
-    Path(job["record"]).write_text(json.dumps(record))
+if behaviour != "silent": Path(job["record"]).write_text(json.dumps(record))
 with (here / "ran.txt").open("a") as file:
     file.write(f"{name} {os.environ.get('CUDA_VISIBLE_DEVICES')}\\n")
 """
@@ -99,9 +97,10 @@ def test_everything_is_run_once_and_reported(fake, capsys):
     assert len(ran(fake)) == 4, "a finished run was repeated"
 
 
-def test_what_is_no_method_is_told_before_the_first_run(fake):
-    with pytest.raises(InputError, match="runs: NRF: 'nrfgs-shh' is no method of ns-train"):
-        bench_in(fake, FILE.replace("NRF: nrfgs", "NRF: nrfgs-shh")).main()
+@pytest.mark.parametrize("run", ["nrfgs-shh", "{method: nrfgs, options: --pipeline.model.shrinkag 1}"])
+def test_what_ns_train_refuses_is_told_before_the_first_run(run, fake):
+    with pytest.raises(InputError, match="runs: NRF: ('nrfgs-shh' is no method of|ns-train refuses the op)"):
+        bench_in(fake, FILE.replace("NRF: nrfgs", f"NRF: {run}")).main()
     assert not ran(fake)
 
 
@@ -119,7 +118,7 @@ def test_failures_are_listed_and_tried_again(fake):
 
 def test_parts_of_a_file_report_all_that_is_there(fake):
     """Runs, seeds and scenes of the same file, asked for one after the other."""
-    text = FILE.replace("runs: {", "runs: {no split: {method: nrfgs, options: --x 1}, ")
+    text = FILE.replace("runs: {", "runs: {no split: {method: nrfgs, options: --pipeline.model.shrinkage 1}, ")
     text = text.replace("[scene]", "[scene, {path: other, downscale: 2}]")
 
     def rows(**chosen) -> list[list[str]]:
@@ -199,8 +198,8 @@ def test_more_gpus_than_there_are_are_refused(monkeypatch):
 
 def test_a_plan_with_knobs_reports_the_trade(fake):
     """A knob or a single setting is chosen by its name; the default is always there."""
-    knobs = "default: nrfgs\nscenes: [scene]\nseeds: [1, 2]\nsteps: 100\n"
-    knobs += "knobs: {D: {option: --d, values: [4, 8]}, head: {settings: {SH: nrfgs-sh}}, steps: {steps: [50]}}\n"
+    knobs = "default: nrfgs\nscenes: [scene]\nseeds: [1, 2]\nsteps: 100\nknobs: {steps: {steps: [50]}, "
+    knobs += "D: {option: --viewer.jpeg-quality, values: [4, 8]}, head: {settings: {SH: nrfgs-sh}}}\n"
     bench_in(fake, knobs, runs=("D 8", "head")).main()
     runs = ("default", "D_8", "head_SH")
     assert {name for name, _ in ran(fake)} == {f"{run}-own-scene-{seed}" for run in runs for seed in (1, 2)}

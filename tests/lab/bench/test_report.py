@@ -45,6 +45,11 @@ def test_times_are_of_runs_that_were_alone_and_ranked_on_one_machine():
     assert ranks([other, alone], PSNR) == {0: 1, 1: 2} and "different machines" in markdown([other, alone])
 
 
+def test_rows_beyond_their_budget_are_named():
+    rows = [Row("s", name, f"mcmc@{most}", {1: record(30.0)}).fill() for name, most in (("A", 900), ("B", 1000))]
+    assert "since they began with more: A." in markdown(rows)
+
+
 def test_an_average_is_of_rows_that_have_all_scenes():
     """NRF lacks seed 1 on one scene and failed it on the other; GS has no seed that both scenes have."""
     plan = {
@@ -108,11 +113,8 @@ def row(name, *records):
 
 def test_differences_inside_the_noise_are_marked():
     """One deviation for all: pairs 0.2 apart have s = 0.1414, 3 degrees of freedom; t(3) s = 3.182 * 0.1414 = 0.450."""
-    rows = [
-        row("default", record(30.0), record(30.2)),
-        row("near", record(30.4), record(30.6)),
-        row("far", record(30.5), record(30.7)),
-    ]
+    psnrs = {"default": (30.0, 30.2), "near": (30.4, 30.6), "far": (30.5, 30.7)}
+    rows = [row(name, *map(record, pair)) for name, pair in psnrs.items()]
     result = changes(rows, rows[0], PSNR, ratio=False)
     assert result["near"].value == pytest.approx(0.4) and result["near"].is_noise
     assert result["far"].value == pytest.approx(0.5) and not result["far"].is_noise
@@ -123,11 +125,9 @@ def test_differences_inside_the_noise_are_marked():
 
 
 def test_costs_are_ratios_of_geometric_means():
-    rows = [
-        row("default", record(30.0, seconds=10.0), record(30.0, seconds=40.0)),
-        row("half", record(30.0, seconds=5.0), record(30.0, seconds=20.0)),
-        row("shared", record(30.0, jobs=2), record(30.0, jobs=2)),
-    ]
+    seconds = {"default": (10.0, 40.0), "half": (5.0, 20.0)}
+    rows = [row(name, *(record(30.0, seconds=one) for one in pair)) for name, pair in seconds.items()]
+    rows += [row("shared", record(30.0, jobs=2), record(30.0, jobs=2))]
     result = changes(rows, rows[0], BY_NAME["time s"], ratio=True)
     assert result["half"].value == pytest.approx(0.5)
     # The same spread, a factor of 4, in both: s = ln 4 / sqrt 2, 2 degrees of freedom, bound t(2) s = 4.303 * 0.980.

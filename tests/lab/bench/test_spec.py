@@ -67,6 +67,7 @@ def test_which_trainings_a_plan_has():
     ({"strategies": ["mcmc@many"]}, "budget is 'many'"),
     ({"seeds": ["x"]}, "seeds"),
     ({"scenes": ["a b", "a_b"]}, "twice"),
+    ({"runs": {"NRF": {"method": "nrfgs", "scenes": ["bonsia"]}}}, "NRF: scenes: the plan has no bonsia"),
     ({"runs": {"host": {"method": "splatfacto", "strategies": ["original"]}}}, "splatfacto knows no strategy"),
     ({"runs": {"N": {"method": "nrfgs", "options": "--max-num-iterations 9"}}}, "N: options: --max-num.*use steps"),
     ({"options": "--machine.seed=3"}, "options: --machine.seed is given by the benchmark; use seeds"),
@@ -97,16 +98,14 @@ def test_a_preset_keeps_its_steps():
 
 
 # Commands.
-@pytest.mark.parametrize(
-    "strategy, densification", [("own", ErrorGuided()), ("mcmc@77,refine_every=9", Mcmc(budget=77, refine_every=9))]
-)
-def test_the_command_means_what_the_file_says(strategy, densification, tiny_scene, tmp_path):
+@pytest.mark.parametrize("strategy, built", [("own", ErrorGuided()), ("mcmc@7,stop_at=9", Mcmc(budget=7, stop_at=9))])
+def test_the_command_means_what_the_file_says(strategy, built, tiny_scene, tmp_path):
     runs = {"NRF": {"method": "nrfgs", "options": "--pipeline.model.appearance.latent-dim 9"}}
     plan = spec(runs=runs, strategies=[strategy], steps=7, seeds=[5], options="--pipeline.model.num-downscales 0")
     parser = parser_options(tiny_scene.parent, Scene(tiny_scene.name), tmp_path)
     config = parse(command(plan, *cells_of(plan), parser, tmp_path))
     model = config.pipeline.model
-    assert model.densification == densification
+    assert model.densification == built
     assert (config.max_num_iterations, config.machine.seed, model.num_downscales) == (7, 5, 0)
     assert model.appearance.latent_dim == 9
     assert config.pipeline.datamanager.dataparser.data == tiny_scene

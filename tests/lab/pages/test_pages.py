@@ -96,9 +96,7 @@ def test_every_record_is_shown_or_used():
 
 @pytest.mark.parametrize("name", PAGES)
 def test_files_that_a_page_names_are_there(name):
-    paths = re.findall(
-        r"(?<![\w/])(?:nrfgs_ns|nrfgs_lab|tests|results|docs)/[\w/.-]*\.(?:py|md|json|yaml)\b", PAGES[name]
-    )
+    paths = re.findall(r"(?<![\w/])(?:nrfgs_\w+|tests|results|docs)/[\w/.-]*\.(?:py|md|json|yaml)\b", PAGES[name])
     paths = [path for path in paths if "NAME" not in path]
     paths += [name.replace(".", "/") for name in re.findall(r"python -m (nrfgs_(?:ns|lab)[\w.]*)", PAGES[name])]
     assert [path for path in paths if not any((ROOT / f"{path}{end}").exists() for end in ("", ".py"))] == []
