@@ -51,7 +51,8 @@ class Prepare:
     camera_model: CameraModel = "SIMPLE_RADIAL"
     """lens to fit; images are undistorted to a pinhole. OPENCV: for strong distortion and many photographs"""
     camera: Literal["auto", "single", "per-image"] = "auto"
-    """single: one set of intrinsics for all photographs. auto: single if sizes, models and focal lengths agree"""
+    """single: one set of intrinsics for all photographs. auto: one for those of one size, model and focal
+    length"""
     feature_size: int = 1600
     """longest side of the images in which features are found, pixels; 10 or more"""
     features: int = 4096
@@ -87,7 +88,8 @@ class Run:
             self.work / name
             for name in ("photos", "database.db", "model", "undistorted", "likely_pairs.json", "state.json")
         )
-        if self.out.exists() and not self.state_file.is_file() and (self.out.is_file() or any(self.out.iterdir())):
+        ours = self.state_file.is_file() or (self.out / "prepare.json").is_file()
+        if self.out.exists() and not ours and (self.out.is_file() or any(self.out.iterdir())):
             raise InputError(f"{self.out} exists and was not made by `nrfgs prepare`. Name a new or an empty folder.")
         try:
             self.state = dict(json.loads(self.state_file.read_text())) if self.state_file.is_file() else {}
@@ -128,16 +130,18 @@ class Run:
 
     def find_features(self) -> None:
         names, options = self.names, self.options
-        one = options.camera == "single" or options.camera == "auto" and files.same_camera(self.stored, names)
-        if one and (count := len({read_size(self.stored / name) for name in names})) > 1:
+        if options.camera == "single" and (count := len({read_size(self.stored / name) for name in names})) > 1:
             raise InputError(
                 f"--camera is single, but {options.photos} has photographs of {count} sizes. Leave it out."
             )
-        chosen = {"camera_model": options.camera_model, "one_camera": one}
+        cameras = files.same_cameras(self.stored, names) if options.camera == "auto" else [names]
+        if options.camera == "per-image":
+            cameras = [[name] for name in names]
+        chosen = {"camera_model": options.camera_model}
         chosen |= {"longest_side": options.feature_size, "features": options.features}
         database = [self.database, *(self.database.with_name(self.database.name + end) for end in ("-wal", "-shm"))]
-        find = partial(structure.extract_features, self.database, self.stored, names, **chosen)
-        self.stage("features", "find features", database, len(names), find, **chosen)
+        find = partial(structure.extract_features, self.database, self.stored, cameras, **chosen)
+        self.stage("features", "find features", database, len(names), find, cameras=cameras, **chosen)
 
     def choose_pairs(self) -> None:
         names, matching = self.names, self.options.matching
@@ -250,10 +254,10 @@ class Run:
 
     def _advice(self, registered: int, total: int, error: float) -> Iterator[str]:
         """Faults of a reconstruction and their fixes."""
-        if registered < GOOD_SHARE * total:
-            placed = {path.name for path in (self.out / "images").iterdir()}
-            left = [name for name in self.names if name not in placed]
+        placed = {path.name for path in (self.out / "images").iterdir()}
+        if left := [name for name in self.names if name not in placed]:
             yield f"Without a camera: {', '.join(left[:5])}{' ...' if len(left) > 5 else ''}. They are left out."
+        if registered < GOOD_SHARE * total:
             if self.state["models"] > 1:
                 yield f"They fall into {self.state['models']} groups; the largest is used. Take some in between."
             if self.options.matching != "exhaustive" and total > pairs.ALIKE + 1:

@@ -141,11 +141,14 @@ def exif_of_copy(exif: Image.Exif) -> bytes:
     return copy.tobytes()
 
 
-def same_camera(folder: Path, names: list[str]) -> bool:
-    """Whether all photographs agree in size and, by EXIF, in camera model and focal length."""
-    taken = {name: read_exif(folder / name) for name in names}
-    lenses = {name: (exif.get("model"), round(float(exif.get("focal_length", 0)), 2)) for name, exif in taken.items()}
-    return len({(read_size(folder / name), *lens) for name, lens in lenses.items()}) == 1
+def same_cameras(folder: Path, names: list[str]) -> list[list[str]]:
+    """Photographs that agree in size and, by EXIF, in camera model and focal length."""
+    alike: dict[tuple, list[str]] = {}
+    for name in names:
+        exif = read_exif(folder / name)
+        lens = exif.get("model"), round(float(exif.get("focal_length", 0)), 2)
+        alike.setdefault((read_size(folder / name), *lens), []).append(name)
+    return list(alike.values())
 
 
 def import_video(video: Path, folder: Path, frames: int, advance: Advance) -> None:
