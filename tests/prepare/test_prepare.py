@@ -317,14 +317,16 @@ def test_photographs_are_kept_or_made_upright(tmp_path):
     exif[ExifTags.Base.Orientation], exif[ExifTags.Base.Model] = 6, "Camera"
     plain, turned = photo(tmp_path / "a b.JPG"), photo(tmp_path / "c.jpg", (40, 30), exif=exif)
     Image.new("RGBA", (40, 30), (255, 0, 0, 0)).save(tmp_path / "d.png")
-    paths, done = [plain, turned, tmp_path / "d.png", photo(tmp_path / "e.bmp")], []
+    renamed, done = photo(tmp_path / "f.jpg", format="WEBP"), []
+    paths = [plain, turned, tmp_path / "d.png", photo(tmp_path / "e.bmp"), renamed]
     photos.import_photos(paths, tmp_path / "stored" / "photos", done.append)
     stored = {path.name: path for path in (tmp_path / "stored" / "photos").iterdir()}
-    assert set(stored) == {"a_b.jpg", "c.jpg", "d.png", "e.png"} and len(done) == 4
+    assert set(stored) == {"a_b.jpg", "c.jpg", "d.png", "e.png", "f.jpg"} and len(done) == 5
     assert stored["a_b.jpg"].read_bytes() == plain.read_bytes(), "not encoded a second time"
     with Image.open(stored["c.jpg"]) as image:
         assert image.size == (30, 40) and image.getexif().get(ExifTags.Base.Orientation, 1) == 1
         assert image.getexif()[ExifTags.Base.Model] == "Camera", "the lens is a first guess of the focal length"
+    assert Image.open(stored["f.jpg"]).format == "JPEG", "COLMAP reads by the suffix"
     with Image.open(stored["d.png"]) as image:
         assert image.mode == "RGB" and image.getpixel((0, 0)) == (255, 255, 255)
 
