@@ -35,6 +35,8 @@ GOOD_SHARE = 0.9
 """Share of the photographs that a good reconstruction places."""
 GOOD_ERROR = 1.5
 """Mean reprojection error of a good reconstruction, pixels."""
+SHORTEST = 0.3
+"""Focal length over the longer side, of a lens of 118 degrees; below it the cameras are probably wrong."""
 
 
 @dataclass
@@ -243,16 +245,18 @@ class Run:
         }
         write_whole(self.out / "prepare.json", json.dumps(numbers, indent=1) + "\n")
         error = numbers["mean_reprojection_error_px"]
+        cameras = [model.cameras[model.images[number].camera_id] for number in model.reg_image_ids()]
+        shortest = min(camera.mean_focal_length() / max(camera.width, camera.height) for camera in cameras)
         found = f"{registered} of {total} photographs have a camera, {numbers['points']:,} points"
         command = shlex.join(["ns-train", "nrfgs", "--data", str(self.out)])
         for line in (
             f"{found}, mean reprojection error {error:.2f} px.",
-            *(f"- {advice}" for advice in self._advice(registered, total, error)),
+            *(f"- {advice}" for advice in self._advice(registered, total, error, shortest)),
             f"Train with: {command}",
         ):
             self.screen.print(line, markup=False, highlight=False, soft_wrap=True)
 
-    def _advice(self, registered: int, total: int, error: float) -> Iterator[str]:
+    def _advice(self, registered: int, total: int, error: float, shortest: float) -> Iterator[str]:
         """Faults of a reconstruction and their fixes."""
         placed = {path.name for path in (self.out / "images").iterdir()}
         if left := [name for name in self.names if name not in placed]:
@@ -265,3 +269,6 @@ class Run:
             yield "Try --features 8192, or take more photographs, sharp and with more overlap."
         if error > GOOD_ERROR:
             yield "The error is large: try --camera-model OPENCV, or --camera per-image if the zoom was changed."
+        if shortest < SHORTEST:
+            found = f"A focal length is {shortest:.2f} of the longer side, as of hardly any lens"
+            yield f"{found}: the cameras are probably wrong. Keep the photographs' EXIF, or take more, from the sides."

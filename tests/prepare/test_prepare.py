@@ -164,7 +164,8 @@ def test_finished_work_is_not_repeated_and_changes_are_noticed(prepared, walls, 
     said = run_quietly(source, out)
     assert "6 of 6 photographs" in said and "ns-train nrfgs" in said and "Without a camera" not in said
     photo(out / "work" / "photos" / "pet.jpg")
-    assert list(Run(Prepare(source, out))._advice(19, 20, 0.5)) == ["Without a camera: pet.jpg. They are left out."]
+    left, wide = Run(Prepare(source, out))._advice(19, 20, 0.5, 0.2)
+    assert left == "Without a camera: pet.jpg. They are left out." and "0.20 of the longer side" in wide
     (out / "work" / "photos" / "pet.jpg").unlink()
 
     # Another option: everything from the features on, whose function is gone; and back: what was overwritten is not
