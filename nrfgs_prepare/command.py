@@ -35,6 +35,8 @@ GOOD_SHARE = 0.9
 """Share of the photographs that a good reconstruction places."""
 GOOD_ERROR = 1.5
 """Mean reprojection error of a good reconstruction, pixels."""
+SHORTEST = 0.3
+"""Focal length over the longer side, of a lens of 118 degrees; below it the cameras are probably wrong."""
 
 
 @dataclass
@@ -51,7 +53,8 @@ class Prepare:
     camera_model: CameraModel = "SIMPLE_RADIAL"
     """lens to fit; images are undistorted to a pinhole. OPENCV: for strong distortion and many photographs"""
     camera: Literal["auto", "single", "per-image"] = "auto"
-    """single: one set of intrinsics for all photographs. auto: single if sizes, models and focal lengths agree"""
+    """single: one set of intrinsics for all photographs. auto: one for those of one size, model and focal
+    length"""
     feature_size: int = 1600
     """longest side of the images in which features are found, pixels; 10 or more"""
     features: int = 4096
@@ -87,7 +90,8 @@ class Run:
             self.work / name
             for name in ("photos", "database.db", "model", "undistorted", "likely_pairs.json", "state.json")
         )
-        if self.out.exists() and not self.state_file.is_file() and (self.out.is_file() or any(self.out.iterdir())):
+        ours = self.state_file.is_file() or (self.out / "prepare.json").is_file()
+        if self.out.exists() and not ours and (self.out.is_file() or any(self.out.iterdir())):
             raise InputError(f"{self.out} exists and was not made by `nrfgs prepare`. Name a new or an empty folder.")
         try:
             self.state = dict(json.loads(self.state_file.read_text())) if self.state_file.is_file() else {}
@@ -128,16 +132,18 @@ class Run:
 
     def find_features(self) -> None:
         names, options = self.names, self.options
-        one = options.camera == "single" or options.camera == "auto" and files.same_camera(self.stored, names)
-        if one and (count := len({read_size(self.stored / name) for name in names})) > 1:
+        if options.camera == "single" and (count := len({read_size(self.stored / name) for name in names})) > 1:
             raise InputError(
                 f"--camera is single, but {options.photos} has photographs of {count} sizes. Leave it out."
             )
-        chosen = {"camera_model": options.camera_model, "one_camera": one}
+        cameras = files.same_cameras(self.stored, names) if options.camera == "auto" else [names]
+        if options.camera == "per-image":
+            cameras = [[name] for name in names]
+        chosen = {"camera_model": options.camera_model}
         chosen |= {"longest_side": options.feature_size, "features": options.features}
         database = [self.database, *(self.database.with_name(self.database.name + end) for end in ("-wal", "-shm"))]
-        find = partial(structure.extract_features, self.database, self.stored, names, **chosen)
-        self.stage("features", "find features", database, len(names), find, **chosen)
+        find = partial(structure.extract_features, self.database, self.stored, cameras, **chosen)
+        self.stage("features", "find features", database, len(names), find, cameras=cameras, **chosen)
 
     def choose_pairs(self) -> None:
         names, matching = self.names, self.options.matching
@@ -239,21 +245,23 @@ class Run:
         }
         write_whole(self.out / "prepare.json", json.dumps(numbers, indent=1) + "\n")
         error = numbers["mean_reprojection_error_px"]
+        cameras = [model.cameras[model.images[number].camera_id] for number in model.reg_image_ids()]
+        shortest = min(camera.mean_focal_length() / max(camera.width, camera.height) for camera in cameras)
         found = f"{registered} of {total} photographs have a camera, {numbers['points']:,} points"
         command = shlex.join(["ns-train", "nrfgs", "--data", str(self.out)])
         for line in (
             f"{found}, mean reprojection error {error:.2f} px.",
-            *(f"- {advice}" for advice in self._advice(registered, total, error)),
+            *(f"- {advice}" for advice in self._advice(registered, total, error, shortest)),
             f"Train with: {command}",
         ):
             self.screen.print(line, markup=False, highlight=False, soft_wrap=True)
 
-    def _advice(self, registered: int, total: int, error: float) -> Iterator[str]:
+    def _advice(self, registered: int, total: int, error: float, shortest: float) -> Iterator[str]:
         """Faults of a reconstruction and their fixes."""
-        if registered < GOOD_SHARE * total:
-            placed = {path.name for path in (self.out / "images").iterdir()}
-            left = [name for name in self.names if name not in placed]
+        placed = {path.name for path in (self.out / "images").iterdir()}
+        if left := [name for name in self.names if name not in placed]:
             yield f"Without a camera: {', '.join(left[:5])}{' ...' if len(left) > 5 else ''}. They are left out."
+        if registered < GOOD_SHARE * total:
             if self.state["models"] > 1:
                 yield f"They fall into {self.state['models']} groups; the largest is used. Take some in between."
             if self.options.matching != "exhaustive" and total > pairs.ALIKE + 1:
@@ -261,3 +269,6 @@ class Run:
             yield "Try --features 8192, or take more photographs, sharp and with more overlap."
         if error > GOOD_ERROR:
             yield "The error is large: try --camera-model OPENCV, or --camera per-image if the zoom was changed."
+        if shortest < SHORTEST:
+            found = f"A focal length is {shortest:.2f} of the longer side, as of hardly any lens"
+            yield f"{found}: the cameras are probably wrong. Keep the photographs' EXIF, or take more, from the sides."

@@ -29,8 +29,8 @@ from nrfgs_prepare.pairs import Advance
 
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", *HEIF)
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-KEPT = (".jpg", ".jpeg", ".png")
-"""Suffixes of files that are copied; others become PNG."""
+KEPT = {".jpg": ("JPEG", "MPO"), ".jpeg": ("JPEG", "MPO"), ".png": ("PNG",)}
+"""Suffixes of files that are copied if they are what the suffix says; files with others become PNG."""
 KEPT_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.DateTime)
 KEPT_DETAILS = (*NUMBERS.values(), ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Base.DateTimeOriginal)
 """Tags of the main and the photographic directory that hold for a turned or smaller copy, too."""
@@ -123,7 +123,7 @@ def _store(image: Image.Image, path: Path, target: Path) -> None:
         image.load()
     exif = exif_of(image)
     upright = exif.get(ExifTags.Base.Orientation, 1) == 1
-    if upright and image.mode in ("RGB", "L") and path.suffix.lower() in KEPT:
+    if upright and image.mode in ("RGB", "L") and image.format in KEPT.get(path.suffix.lower(), ()):
         shutil.copyfile(path, target)
         return
     turned = ImageOps.exif_transpose(image)
@@ -141,11 +141,14 @@ def exif_of_copy(exif: Image.Exif) -> bytes:
     return copy.tobytes()
 
 
-def same_camera(folder: Path, names: list[str]) -> bool:
-    """Whether all photographs agree in size and, by EXIF, in camera model and focal length."""
-    taken = {name: read_exif(folder / name) for name in names}
-    lenses = {name: (exif.get("model"), round(float(exif.get("focal_length", 0)), 2)) for name, exif in taken.items()}
-    return len({(read_size(folder / name), *lens) for name, lens in lenses.items()}) == 1
+def same_cameras(folder: Path, names: list[str]) -> list[list[str]]:
+    """Photographs that agree in size and, by EXIF, in camera model and focal length."""
+    alike: dict[tuple, list[str]] = {}
+    for name in names:
+        exif = read_exif(folder / name)
+        lens = exif.get("model"), round(float(exif.get("focal_length", 0)), 2)
+        alike.setdefault((read_size(folder / name), *lens), []).append(name)
+    return list(alike.values())
 
 
 def import_video(video: Path, folder: Path, frames: int, advance: Advance) -> None:

@@ -4,6 +4,7 @@
 COLMAP's database keeps features and matches, so that an interrupted step continues.
 """
 
+import itertools
 import os
 import shutil
 import tempfile
@@ -28,6 +29,8 @@ SMALLEST_MODEL = 3
 FEWEST_POINTS = 10
 """Minimum number of points per photograph of a globally mapped model."""
 SEED = 0
+BYTES_PER_FEATURE = 300
+"""Room for a feature and its matches in the database."""
 CUT = "was not written whole: the disk may be full. Make room, and run this again."
 
 
@@ -47,38 +50,46 @@ def colmap():
 def extract_features(
     database: Path,
     photos: Path,
-    names: list[str],
+    cameras: list[list[str]],
     advance: Advance,
     camera_model: CameraModel,
-    one_camera: bool,
     longest_side: int,
     features: int,
 ) -> None:
-    """Find at most `features` SIFT features in every photograph, shrunk to `longest_side` pixels, on the CPU; with
-    `one_camera` all share their intrinsics."""
+    """Find at most `features` SIFT features in every photograph, shrunk to `longest_side` pixels, on the CPU; each of
+    `cameras` is a list of photographs that share their intrinsics. InputError where the disk lacks room."""
     pycolmap = colmap()
+    every = list(itertools.chain(*cameras))
+    needed, free = BYTES_PER_FEATURE * features * len(every), shutil.disk_usage(database.parent).free
+    if free < needed:  # COLMAP would abort the whole process
+        found = f"features may take {needed / 1e6:.1f} MB, and {free / 1e6:.1f} MB are free"
+        raise InputError(f"{database.parent}: {found}. Make room, or give a smaller --features.")
     options = pycolmap.FeatureExtractionOptions(max_image_size=longest_side)
     options.sift.max_num_features = features
     reader = pycolmap.ImageReaderOptions(camera_model=camera_model)
     batch = max(os.cpu_count() or 1, 4)
-    for first in range(0, len(names), batch):
-        part = names[first : first + batch]
-        sizes = [read_size(photos / name) for name in part]
-        searched = min(w * h * min(1.0, longest_side / max(w, h)) ** 2 for w, h in sizes)
-        options.sift.first_octave = 0 if searched >= LARGE else -1  # -1: the photograph is doubled first
-        if one_camera and first > 0:
-            reader.existing_camera_id = 1  # each call would make a camera of its own
-        pycolmap.extract_features(
-            database,
-            photos,
-            image_names=part,
-            camera_mode=pycolmap.CameraMode.SINGLE if one_camera else pycolmap.CameraMode.PER_IMAGE,
-            reader_options=reader,
-            extraction_options=options,
-            device=pycolmap.Device.cpu,
-        )
-        advance(len(part))
-    _scale_focal_lengths(database, photos, names)
+    alone = [names[0] for names in cameras if len(names) == 1]
+    for names in (alone, *(names for names in cameras if len(names) > 1)):
+        for first in range(0, len(names), batch):
+            part = names[first : first + batch]
+            sizes = [read_size(photos / name) for name in part]
+            searched = min(w * h * min(1.0, longest_side / max(w, h)) ** 2 for w, h in sizes)
+            options.sift.first_octave = 0 if searched >= LARGE else -1  # -1: the photograph is doubled first
+            if names is not alone:  # each call would make a camera of its own
+                with pycolmap.Database.open(database) as opened:
+                    known = opened.read_image_with_name(names[0])
+                reader.existing_camera_id = known.camera_id if known else -1
+            pycolmap.extract_features(
+                database,
+                photos,
+                image_names=part,
+                camera_mode=pycolmap.CameraMode.PER_IMAGE if names is alone else pycolmap.CameraMode.SINGLE,
+                reader_options=reader,
+                extraction_options=options,
+                device=pycolmap.Device.cpu,
+            )
+            advance(len(part))
+    _scale_focal_lengths(database, photos, every)
 
 
 def _scale_focal_lengths(database: Path, photos: Path, names: list[str]) -> None:

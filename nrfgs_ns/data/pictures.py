@@ -60,8 +60,7 @@ def naming(path: Path, finding: str) -> Iterator[None]:
         yield
     except Exception as error:
         raise InputError(
-            f"{path} {finding} ({str(error) or type(error).__name__}). Restore the file, or remove its frame from the "
-            "data set."
+            f"{path} {finding} ({str(error) or type(error).__name__}). Restore the file, or leave it out."
         ) from error
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any
 
+import torch
 from nerfstudio.cameras.cameras import Cameras
 
 from nrfgs_ns.data.checks import some
@@ -46,15 +47,18 @@ def data_set_of(names: list[str], cameras: Cameras) -> dict[str, Any]:
     return {"images": names, "centers": cameras.camera_to_worlds[:, :3, 3].detach().cpu().clone()}
 
 
-def check_data_set(written: Mapping[str, Any], here: Mapping[str, Any], data: object) -> None:
-    """Raise InputError where a checkpoint was trained on another data set."""
+def check_data_set(written: Mapping[str, Any], here: Mapping[str, Any], data: object, to_train: bool) -> None:
+    """Raise InputError where a checkpoint was trained on other images, which only a training minds, or other poses."""
     fix = "Go on with the data set that it was trained on, or train anew."
-    if sorted(written["images"]) != sorted(here["images"]):
+    if to_train and written["images"] != here["images"]:
         differ = sorted(set(written["images"]) ^ set(here["images"]))
-        what = some(differ) if differ else "in other numbers"
+        what = some(differ) if differ else "in other numbers, or in another order"
         raise InputError(f"{data}: the checkpoint was trained on other images ({what}). {fix}")
     centers, now = written["centers"].double(), here["centers"].double()
     extent = float((centers.amax(0) - centers.amin(0)).max())
+    if written["images"] != here["images"]:
+        known = dict(zip(written["images"], centers, strict=True))
+        centers = torch.stack([known.get(name, center) for name, center in zip(here["images"], now, strict=True)])
     moved = (centers - now).norm(dim=1) > FAR * max(extent, 1e-12)
     if bool(moved.any()):
         which = some([here["images"][i] for i in moved.nonzero().flatten().tolist()])

@@ -20,6 +20,7 @@ from torchvision.utils import save_image
 
 from nrfgs_ns.appearance.head import AppearanceHead
 from nrfgs_ns.compact.decode import decode, model_state
+from nrfgs_ns.data.checks import warn
 from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
 from nrfgs_ns.densification import statistics
 from nrfgs_ns.errors import InputError
@@ -32,6 +33,7 @@ from nrfgs_ns.threads import few_threads
 from nrfgs_ns.training import optimizers
 from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints
 from nrfgs_ns.training.config_file import check_types
+from nrfgs_ns.training.identity import check_data_set, data_set_of
 from nrfgs_ns.training.photographs import check_same_photographs, photograph_model
 from nrfgs_ns.training.step_graph import StepGraphs
 from nrfgs_ns.viewer.panel import ViewerPanel
@@ -106,11 +108,20 @@ class NrfgsPipeline(VanillaPipeline):
             )
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
-        """Load a checkpoint, or the compact file that the configuration names; InputError if it does not fit."""
+        """Load a checkpoint, or the compact file that the configuration names; InputError if it does not fit.
+        On another data set no training goes on; what is finished can still be looked at."""
+        training = self.test_mode == "val"
+        if (scene := loaded_state.get("_extra_state", {}).get("scene")) is not None:  # a compact file has none
+            try:
+                check_data_set(scene, self._data_set(), self.datamanager.get_datapath(), training)
+            except InputError as error:
+                if training:
+                    raise
+                warn(f"{error} Here metrics are wrong, and so is what is fitted to the views.")
         if self.config.compact is not None:
             state = model_state(self.model, decode(self.config.compact))
             loaded_state = {f"_model.{name}": value for name, value in state.items()}
-        if self.test_mode == "val":
+        if training:
             check_same_photographs(self.model.photograph, loaded_state.get("_model.photograph._extra_state"))
         super().load_pipeline(loaded_state, step)
 
@@ -179,14 +190,19 @@ class NrfgsPipeline(VanillaPipeline):
         return result
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Random generators and the order of the cameras, as numbers, strings and tensors, which torch reads without
-        trusting the file."""
+        """Random generators, the order of the cameras and the data set, as numbers, strings and tensors, which torch
+        reads without trusting the file."""
         return {
             "torch_rng": torch.get_rng_state(),
             "cuda_rng": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
             "python_rng": json.dumps(random.getstate()),
             "sampling": self.datamanager.sampling_state(),
+            "scene": self._data_set(),
         }
+
+    def _data_set(self) -> dict[str, Any]:
+        data = self.datamanager.train_dataset
+        return data_set_of([Path(name).name for name in data.image_filenames], data.cameras)
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` gave, in a training; an evaluation ignores it."""

@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import reduce
-from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -30,7 +29,7 @@ from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.averaging import ParameterMean, window
 from nrfgs_ns.training.checkpoint_files import DiskFull
 from nrfgs_ns.training.guard import Guard, TrainingStopped
-from nrfgs_ns.training.identity import check_data_set, check_options, data_set_of, options_of
+from nrfgs_ns.training.identity import check_options, options_of
 from nrfgs_ns.training.optimizers import LeanOptimizers
 from nrfgs_ns.training.pace import Pace, TimedPace
 from nrfgs_ns.training.progress import ProgressLine, end_earlier_logs
@@ -134,7 +133,6 @@ class NrfgsTrainer(Trainer):
             raise InputError(f"{path} is of another method, such as splatfacto. Train anew, without --load-dir.")
         self._start_step = content["step"] + 1
         training = content["training"]
-        check_data_set(training["scene"], self._data_set(), self.pipeline.datamanager.get_datapath())
         self.pipeline.load_pipeline(content["pipeline"], content["step"])
         check_options(training["options"], options_of(config))
         if config.time_budget is None and self._start_step >= self.total_steps:
@@ -152,10 +150,6 @@ class NrfgsTrainer(Trainer):
         budget = config.time_budget
         total = f"{self.total_steps:,}" if budget is None else f"as many as fit into {budget:g} minutes"
         CONSOLE.print(f"Going on from {path}, at step {self._start_step} of {total}.", markup=False, soft_wrap=True)
-
-    def _data_set(self) -> dict[str, Any]:
-        data = self.pipeline.datamanager.train_dataset
-        return data_set_of([Path(name).name for name in data.image_filenames], data.cameras)
 
     def _follow(self, written: dict[str, Any] | None) -> None:
         """Go on from the checkpoint's position on the schedules; the remaining steps walk through the rest."""
@@ -401,7 +395,7 @@ class NrfgsTrainer(Trainer):
 
     def _checkpoint(self, step: int) -> dict[str, Any]:
         """A checkpoint's content: nerfstudio's entries, and "training", which this class needs to resume."""
-        training: dict[str, Any] = {"scene": self._data_set(), "options": options_of(self.config)}
+        training: dict[str, Any] = {"options": options_of(self.config)}
         if self.pace is not None:
             training["pace"] = self.pace.state()
         if self.mean is not None and self.mean.is_saved and self.mean.count > 0:

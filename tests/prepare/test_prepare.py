@@ -162,7 +162,11 @@ def test_finished_work_is_not_repeated_and_changes_are_noticed(prepared, walls, 
     for name in ("extract_features", "match_features", "find_cameras", "undistort"):
         monkeypatch.setattr(structure, name, Mock(side_effect=TypeError))
     said = run_quietly(source, out)
-    assert "6 of 6 photographs" in said and "ns-train nrfgs" in said
+    assert "6 of 6 photographs" in said and "ns-train nrfgs" in said and "Without a camera" not in said
+    photo(out / "work" / "photos" / "pet.jpg")
+    left, wide = Run(Prepare(source, out))._advice(19, 20, 0.5, 0.2)
+    assert left == "Without a camera: pet.jpg. They are left out." and "0.20 of the longer side" in wide
+    (out / "work" / "photos" / "pet.jpg").unlink()
 
     # Another option: everything from the features on, whose function is gone; and back: what was overwritten is not
     # taken for finished.
@@ -180,10 +184,13 @@ def test_finished_work_is_not_repeated_and_changes_are_noticed(prepared, walls, 
 
 
 def test_interrupted_features_are_taken_up(walls, tmp_path, monkeypatch):
-    """Killed after the first photographs: COLMAP is then asked for all, and keeps what its database has."""
-    dying = Mock(wraps=structure.colmap().extract_features, side_effect=[DEFAULT, KeyboardInterrupt])
+    """Killed after the upright photograph and four of the others: COLMAP is then asked for all, keeps what its database
+    has, and the others still share one camera."""
+    dying = Mock(wraps=structure.colmap().extract_features, side_effect=[DEFAULT, DEFAULT, KeyboardInterrupt])
     monkeypatch.setattr(structure.os, "cpu_count", lambda: 4)
-    run = Run(Prepare(walls, tmp_path / "scene"), Console(quiet=True))
+    mixed = shutil.copytree(walls, tmp_path / "photos")
+    render_walls(walk(6)[0]).rotate(90, expand=True).save(mixed / "IMG 00.png")
+    run = Run(Prepare(mixed, tmp_path / "scene"), Console(quiet=True))
     run.import_input()
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(structure.colmap(), "extract_features", dying)
@@ -191,11 +198,11 @@ def test_interrupted_features_are_taken_up(walls, tmp_path, monkeypatch):
 
     def with_features() -> list[bool]:
         with structure.colmap().Database.open(run.database) as database:
-            assert database.num_cameras() == 1
+            assert database.num_cameras() == 2
             return [database.exists_keypoints(image.image_id) for image in database.read_all_images()]
 
-    assert with_features() == [True] * 4
-    run = Run(Prepare(walls, tmp_path / "scene"), Console(quiet=True))
+    assert with_features() == [True] * 5
+    run = Run(Prepare(mixed, tmp_path / "scene"), Console(quiet=True))
     run.import_input()
     run.find_features()
     assert with_features() == [True] * 6
@@ -278,6 +285,8 @@ def test_damaged_work_is_told_in_one_sentence(prepared, walls, tmp_path, file, c
     (out / "work" / file).write_text(content)
     with pytest.raises(InputError, match=said):
         Prepare(walls, out).main()
+    shutil.rmtree(out / "work")
+    Run(Prepare(walls, out))  # as the message says
 
 
 def test_what_colmap_could_not_write_whole_is_not_built_on(prepared, tmp_path, monkeypatch):
@@ -309,14 +318,16 @@ def test_photographs_are_kept_or_made_upright(tmp_path):
     exif[ExifTags.Base.Orientation], exif[ExifTags.Base.Model] = 6, "Camera"
     plain, turned = photo(tmp_path / "a b.JPG"), photo(tmp_path / "c.jpg", (40, 30), exif=exif)
     Image.new("RGBA", (40, 30), (255, 0, 0, 0)).save(tmp_path / "d.png")
-    paths, done = [plain, turned, tmp_path / "d.png", photo(tmp_path / "e.bmp")], []
+    renamed, done = photo(tmp_path / "f.jpg", format="WEBP"), []
+    paths = [plain, turned, tmp_path / "d.png", photo(tmp_path / "e.bmp"), renamed]
     photos.import_photos(paths, tmp_path / "stored" / "photos", done.append)
     stored = {path.name: path for path in (tmp_path / "stored" / "photos").iterdir()}
-    assert set(stored) == {"a_b.jpg", "c.jpg", "d.png", "e.png"} and len(done) == 4
+    assert set(stored) == {"a_b.jpg", "c.jpg", "d.png", "e.png", "f.jpg"} and len(done) == 5
     assert stored["a_b.jpg"].read_bytes() == plain.read_bytes(), "not encoded a second time"
     with Image.open(stored["c.jpg"]) as image:
         assert image.size == (30, 40) and image.getexif().get(ExifTags.Base.Orientation, 1) == 1
         assert image.getexif()[ExifTags.Base.Model] == "Camera", "the lens is a first guess of the focal length"
+    assert Image.open(stored["f.jpg"]).format == "JPEG", "COLMAP reads by the suffix"
     with Image.open(stored["d.png"]) as image:
         assert image.mode == "RGB" and image.getpixel((0, 0)) == (255, 255, 255)
 
@@ -334,21 +345,24 @@ def test_focal_lengths_follow_photographs_that_were_made_smaller(tmp_path, make,
     exif.get_ifd(ExifTags.IFD.Exif).update({getattr(ExifTags.Base, name): value for name, value in tags.items()})
     photo(tmp_path / "a.jpg", (160, 120), exif=exif.tobytes())
     database = tmp_path / "database.db"
-    structure.extract_features(database, tmp_path, ["a.jpg"], lambda _: None, "SIMPLE_RADIAL", True, 1600, 100)
+    structure.extract_features(database, tmp_path, [["a.jpg"]], lambda _: None, "SIMPLE_RADIAL", 1600, 100)
     with structure.colmap().Database.open(database) as opened:
         (camera,) = opened.read_all_cameras()
     assert camera.has_prior_focal_length and camera.mean_focal_length() == pytest.approx(focal_length, abs=0.01)
 
 
-def test_a_photograph_that_colmap_leaves_out_is_named(tmp_path):
+def test_a_photograph_that_colmap_leaves_out_is_named_and_so_is_a_full_disk(tmp_path, monkeypatch):
     photo(tmp_path / "a.jpg", (160, 120))
     photo(tmp_path / "b.jpg", (120, 160))  # not of the one camera
-    both, database = ["a.jpg", "b.jpg"], tmp_path / "database.db"
+    both, database = [["a.jpg", "b.jpg"]], tmp_path / "database.db"
     with pytest.raises(InputError, match="b.jpg is left out by COLMAP"):
-        structure.extract_features(database, tmp_path, both, lambda _: None, "SIMPLE_RADIAL", True, 1600, 100)
+        structure.extract_features(database, tmp_path, both, lambda _: None, "SIMPLE_RADIAL", 1600, 100)
+    monkeypatch.setattr(structure.shutil, "disk_usage", lambda _: Mock(free=10_000))  # where COLMAP would abort
+    with pytest.raises(InputError, match="0.1 MB, and 0.0 MB are free. Make room"):
+        structure.extract_features(database, tmp_path, both, lambda _: None, "SIMPLE_RADIAL", 1600, 100)
 
 
-def test_names_stay_different_and_one_camera_needs_all_to_agree_with_damaged_exif_as_none(tmp_path):
+def test_names_stay_different_and_those_that_agree_share_a_camera_with_damaged_exif_as_none(tmp_path):
     given = ["00002_a_b.jpg", "a b.jpg", "a_b.jpg", "a_b.jpeg", "\udcff.jpg"]
     given += [f"{letters}.jpg" for letters in ("ä" * 100, "ö" * 100, "x" * 250)]
     names = photos.stored_names([Path(name) for name in given])
@@ -357,8 +371,7 @@ def test_names_stay_different_and_one_camera_needs_all_to_agree_with_damaged_exi
     exif = b"Exif\0\0II*\0\x08\0\0\0\xff\xff" + bytes(range(200))
     paths = [photo(tmp_path / "in" / f"{i}.jpg", size, exif=exif) for i, size in enumerate([(40, 30)] * 2 + [(30, 40)])]
     photos.import_photos(paths, tmp_path / "stored", lambda _: None)
-    assert photos.same_camera(tmp_path / "stored", ["0.jpg", "1.jpg"])
-    assert not photos.same_camera(tmp_path / "stored", ["0.jpg", "2.jpg"])
+    assert photos.same_cameras(tmp_path / "stored", ["0.jpg", "2.jpg", "1.jpg"]) == [["0.jpg", "1.jpg"], ["2.jpg"]]
 
 
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 50 50\nshowpage\n"

@@ -157,7 +157,7 @@ def test_averaging_changes_no_step(averaged, tiny_scene, tmp_path):
     with_it = checkpoint_of(averaged.config)
     with_it["pipeline"] = plain["pipeline"]
     assert_same_training(plain, with_it, rtol=0, atol=0)
-    assert set(plain["training"]) == {"scene", "options"}
+    assert set(plain["training"]) == {"options"}
 
 
 def test_what_ends_early_stays_the_last_steps(trainer, monkeypatch):

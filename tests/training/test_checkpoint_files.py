@@ -158,15 +158,19 @@ def scene(names=("a.png", "b.png", "c.png"), shift: float = 0.0) -> dict:
     return data_set_of(list(names), SimpleNamespace(camera_to_worlds=poses))
 
 
-@pytest.mark.parametrize(("here", "message"), [
-    (scene(("a.png", "x.png", "c.png")), r"other images \(b.png, x.png\)"),
-    (scene(("a.png", "b.png")), r"other images \(c.png\)"),
-    (scene(shift=0.1), r"other poses \(b.png elsewhere\)"),
+@pytest.mark.parametrize(("here", "going_on", "afterwards"), [
+    (scene(("a.png", "x.png", "c.png")), r"other images \(b.png, x.png\)", None),
+    (scene(("a.png", "b.png")), r"other images \(c.png\)", None),
+    (scene(("a.png", "c.png", "b.png")), "in another order", r"other poses \(c.png, b.png elsewhere\)"),
+    (scene(("a.png", "b.png", "new.png"), shift=0.1), r"other images \(c", r"other poses \(b.png elsewhere\)"),
+    (scene(shift=0.1), r"other poses \(b.png elsewhere\)", r"other poses \(b.png elsewhere\)"),
 ])  # fmt: skip
-def test_another_scene_is_refused(here, message):
-    check_data_set(scene(), scene(shift=1e-4), "elsewhere")
-    with pytest.raises(InputError, match=message):
-        check_data_set(scene(), here, "data/fox")
+def test_another_scene_is_refused(here, going_on, afterwards):
+    check_data_set(scene(), scene(shift=1e-4), "elsewhere", to_train=True)
+    with pytest.raises(InputError, match=going_on):
+        check_data_set(scene(), here, "data/fox", to_train=True)
+    with pytest.raises(InputError, match=afterwards) if afterwards else contextlib.nullcontext():
+        check_data_set(scene(), here, "data/fox", to_train=False)
 
 
 @pytest.mark.parametrize("name, value, may_change", [

@@ -213,13 +213,16 @@ def test_a_folder_beyond_the_systems_encoding_and_images_too_small_to_begin_with
         ready(tiny_scene, tmp_path, {"--pipeline.datamanager.camera-res-scale-factor": 0.01})
 
 
-def test_another_scene_other_options_and_another_method_are_refused(finished, tiny_scene, tmp_path):
+def test_another_scene_other_options_and_another_method_are_refused(finished, tiny_scene, tmp_path, capsys):
     from nrfgs_lab.scenes import SceneConfig, write_scene
 
     other = write_scene(SceneConfig(views=10, width=48, height=36, points=300, samples=1, seed=5), tmp_path / "other")
     resumed = {"--load-dir": models_of(finished)}
     with pytest.raises(InputError, match="trained on other (poses|images)"):
         ready(other, tmp_path / "b", resumed, steps=STEPS + 2)
+    evaluated = parse(command_line("nrfgs", other, tmp_path, 1, BUSY)).pipeline.setup(device="cpu", test_mode="test")
+    evaluated.load_pipeline(checkpoint_of(finished)["pipeline"], STEPS)  # as ns-eval calls it
+    assert re.search(r"Warning: .*trained on other poses .*elsewhere\).* metrics are wrong", capsys.readouterr().out)
     with pytest.raises(InputError, match="--pipeline.model.appearance.color-scale was 0.2 and is 0.3"):
         ready(tiny_scene, tmp_path / "c", resumed, {"--pipeline.model.appearance.color-scale": 0.3}, steps=STEPS + 2)
     own = {"step": 9, "pipeline": {"_model.gauss_params.means": torch.zeros(3, 3)}, "optimizers": {}, "schedulers": {}}
