@@ -26,10 +26,7 @@ METHODS = {NRF: "NRF", SH: "SH"}
 """Method -> its label."""
 RATES = {
     NRF: {"--optimizers.latents.optimizer.lr": 0.01},
-    SH: {
-        "--optimizers.features-rest.optimizer.lr": 0.003,
-        "--pipeline.model.appearance.degree-interval": 3000,
-    },
+    SH: {"--optimizers.features-rest.optimizer.lr": 0.003, "--pipeline.model.appearance.degree-interval": 3000},
 }
 """Best of a few rates on another seed of the scene; splatfacto's rates for harmonics are for 30,000 steps."""
 ENOUGH_STEPS = 400

@@ -15,10 +15,7 @@ RIVALS = {
     "harmonics, MCMC": "harmonics, 150,000 splats",
 }
 """Label -> trainings in results/captures.json."""
-GAPS = {
-    "**twice the residual, on the logit**: `nrfgs`": "twice on the logit",
-    "harmonics without noise": "harmonics",
-}
+GAPS = {"**twice the residual, on the logit**: `nrfgs`": "twice on the logit", "harmonics without noise": "harmonics"}
 """Label -> trial with gaps in results/trials.json; its default added the residual to the opacity."""
 
 

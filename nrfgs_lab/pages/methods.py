@@ -72,11 +72,7 @@ def _protocol(run: str) -> str:
 
 # Full size, 30,000 steps, two seeds.
 
-PARTS = {
-    "opacity residual": ("no_opacity", 0.35),
-    "distance": ("no_distance", 0.21),
-    "split": ("no_split", 0.48),
-}
+PARTS = {"opacity residual": ("no_opacity", 0.35), "distance": ("no_distance", 0.21), "split": ("no_split", 0.48)}
 """Part of the field -> the run without, and the part's gain in the paper, in dB."""
 
 

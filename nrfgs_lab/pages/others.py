@@ -33,8 +33,4 @@ def exposure_rule() -> str:
     return f"{len(off)} captures have {min(off):.2f} to {max(off):.2f} stops: off; {', '.join(on)}: on"
 
 
-BLOCKS = {
-    "exposure.gain": exposure_gain,
-    "exposure.rule": exposure_rule,
-    "troubleshooting.attack": attack,
-}
+BLOCKS = {"exposure.gain": exposure_gain, "exposure.rule": exposure_rule, "troubleshooting.attack": attack}
