@@ -19,9 +19,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # Modules that several test files share. tests/ itself would let its folders pass for packages of their names, and
 # nerfbaselines for installed.
 HERE = Path(__file__).resolve().parent
-sys.path[:0] = [
-    str(HERE / name) for name in ("helpers", "fixtures", "appearance", "densification", "image", "rasterizer")
-]
+sys.path[:0] = [str(HERE / d) for d in ("helpers", "fixtures", "appearance", "densification", "image", "rasterizer")]
 
 from processes import hide_open3d, keep_what_is_imported, let_go, open3d_shown  # noqa: E402
 

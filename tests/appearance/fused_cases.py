@@ -53,9 +53,7 @@ def evaluate(head, splats, visible, centers, dtype=torch.float32) -> dict[str, T
     d_opacities = torch.randn(len(visible), generator=generator).to(opacities)
     ((colors * d_colors).sum() + (opacities * d_opacities).sum()).backward()
     inputs = {**leaves, "centers": centers, **dict(head.named_parameters())}
-    gradients = {
-        f"d {name}": torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for name, leaf in inputs.items()
-    }
+    gradients = {f"d {name}": torch.zeros_like(x) if x.grad is None else x.grad for name, x in inputs.items()}
     return {"colors": colors.detach(), "opacities": opacities.detach(), **gradients}
 
 
@@ -123,7 +121,5 @@ def rounding(twin, kinds: tuple[str, str]):
     """Make the float64 twin round the factors of its products as the kernels do; the first bias is such a factor."""
     for branch in filter(None, (twin.low, twin.high)):
         for layer, first in ((branch[0], True), (branch[2], False)):
-            layer.forward = lambda x, layer=layer, first=first: RoundedLinear.apply(
-                x, layer.weight, layer.bias, kinds, first
-            )
+            layer.forward = lambda x, on=layer, first=first: RoundedLinear.apply(x, on.weight, on.bias, kinds, first)
     return twin

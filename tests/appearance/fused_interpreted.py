@@ -125,9 +125,7 @@ def test_extremes(extreme, opacity_bound, scale):
     plain.config, plain.fused.config = twin.config, twin.config
     plain.load_state_dict(twin.state_dict())
     errors = relative_errors(evaluate(plain.float(), *case), exact)
-    assert_near(
-        evaluate(head, *case), exact, {name: float32_tolerance() + 10 * error for name, error in errors.items()}
-    )
+    assert_near(evaluate(head, *case), exact, {n: float32_tolerance() + 10 * error for n, error in errors.items()})
 
 
 @pytest.mark.parametrize("precision", ["tf32", "bf16", "fp16"])

@@ -103,9 +103,7 @@ def fields(values: dict, frame: int | None = None) -> list[Case]:
             (capture.meta if frame is None else capture.meta["frames"][frame])[key] = value
 
         says = "transforms.json", NAMES.get(key, key), *(["006.png"] if frame == 3 and "path" not in key else [])
-        return broken(f"{key} {ascii(value)[:30]}{'' if frame is None else ' of one frame'}", change)._replace(
-            says=says
-        )
+        return broken(f"{key} {ascii(value)[:30]}{' of one frame' * (frame is not None)}", change)._replace(says=says)
 
     return [case(key, value) for key, them in values.items() for value in them]
 

@@ -109,9 +109,8 @@ def test_halves_keep_each_axis_variance_and_the_opacity(places):
         for axis in range(3):
             k = 1 - (1 - 1 / math.sqrt(2)) * float(scales[axis] / scales.max()) ** 2
             for half in (row, other):
-                assert table.splats["scales"][half, axis].exp().item() == pytest.approx(
-                    k * scales[axis].item(), rel=1e-5
-                )
+                new = table.splats["scales"][half, axis].exp().item()
+                assert new == pytest.approx(k * scales[axis].item(), rel=1e-5)
             assert k * k * scales[axis] ** 2 + offset[axis] ** 2 == pytest.approx(scales[axis].item() ** 2, rel=1e-4)
         for half in (row, other):
             assert torch.sigmoid(table.splats["opacities"][half]).item() == pytest.approx(1 - 0.4 ** (1 / math.sqrt(2)))

@@ -123,9 +123,7 @@ def test_the_largest_gradients_grow(name, monkeypatch):
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(
-    not hasattr(torch.cuda, "get_per_process_memory_fraction"), reason="torch < 2.8 tells no process its share"
-)
+@pytest.mark.skipif(not hasattr(torch.cuda, "get_per_process_memory_fraction"), reason="torch < 2.8 tells no share")
 @pytest.mark.parametrize("name", STRATEGIES)
 def test_growth_is_held_in_a_small_share_of_a_card(name, tiny_scene, tmp_path, capsys):
     """A training that would grow without end ends well."""

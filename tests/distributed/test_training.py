@@ -141,9 +141,7 @@ def test_the_trained_model_is_the_mean_of_the_whole(devices):
     for name, last in expected[-1].items():
         mean = torch.stack([state[name] for state in expected]).mean(dim=0)
         assert mean.abs().max() <= 10
-        assert_close(
-            content[f"_model.{name}"].double(), mean, rtol=0, atol=5e-6, msg=lambda text, name=name: name + text
-        )
+        assert_close(content[f"_model.{name}"].double(), mean, rtol=0, atol=5e-6, msg=lambda text, of=name: of + text)
         assert (mean - last).abs().max() > 1e-4, name
     assert "parameter_mean" not in saved(devices[0]["saved"][0], 11, "training")
 

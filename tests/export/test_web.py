@@ -85,9 +85,7 @@ def test_a_tour_of_photographs_or_of_a_camera_path(tmp_path):
         file.write_text(json.dumps(PATH | {"is_cycle": cycle}))
         tour = read_tour([str(file)], NAMES)
         assert (tour["seconds"], tour["loop"]) == (1.0, cycle)
-        assert [view["fov"] for view in tour["views"]] == (
-            [50, 55, 60, 64, 69, 50] if cycle else [50, 55, 59, 64, 68, 73]
-        )
+        assert [v["fov"] for v in tour["views"]] == ([50, 55, 60, 64, 69, 50] if cycle else [50, 55, 59, 64, 68, 73])
         assert tour["views"][0]["matrix"] == [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 10, 20, 30, 1], "column by column"
     file.write_text(json.dumps({"tour": [CAMERA, CAMERA]}))
     assert read_tour([str(file)], NAMES) == {"views": [CAMERA, CAMERA]}

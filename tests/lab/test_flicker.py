@@ -47,9 +47,7 @@ def test_steady_change_is_no_flicker(brighter, change, jitter):
 
     poses = torch.eye(3, 4).repeat(2, 1, 1, 1)
     poses[..., 2, 3], poses[1, ..., 0, 3] = 3.0, 0.45
-    model = SimpleNamespace(
-        pinhole=lambda camera: at(float(camera.camera_to_worlds[0, 0, 3]))[0], get_outputs_for_camera=render
-    )
+    model = SimpleNamespace(pinhole=lambda c: at(float(c.camera_to_worlds[0, 0, 3]))[0], get_outputs_for_camera=render)
     means = flicker(model, [SimpleNamespace(camera_to_worlds=pose) for pose in poses], 4)
     assert means["change"] == pytest.approx(change, abs=1e-3) and means["flicker"] == pytest.approx(jitter, abs=1e-3)
     assert means["compared"] == pytest.approx(14 / 16)

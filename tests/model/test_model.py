@@ -249,9 +249,8 @@ def test_without_a_head_at_the_pixel_the_image_is_what_the_rasterizer_blends(wit
     appearance = Field(head, splats).seen_from(view)
     outputs, _ = composite_view(view, appearance, BACKGROUND, with_depth=with_depth)
     render, alpha, _ = composite(view.projection, *appearance, backgrounds=BACKGROUND[None], with_depth=with_depth)
-    assert torch.equal(outputs["rgb"], render[0, ..., :3].clamp(0, 1)) and torch.equal(
-        outputs["accumulation"], alpha[0]
-    )
+    assert torch.equal(outputs["rgb"], render[0, ..., :3].clamp(0, 1))
+    assert torch.equal(outputs["accumulation"], alpha[0])
     assert len(view.visible) > 3 and outputs["rgb"].std() > 0.05
     if with_depth:
         assert torch.equal(outputs["depth"][alpha[0] > 0], render[0, ..., 3:][alpha[0] > 0])

@@ -75,10 +75,8 @@ def test_steps_are_torchs(monkeypatch):
 def test_a_skipped_step_changes_nothing():
     torch.manual_seed(0)
     optimizers = [adam((7, 3), lr=0.1), adam((4,), lr=0.1)]
-    for optimizer in optimizers:
-        optimizer.param_groups[0]["params"][0].grad = torch.full_like(
-            optimizer.param_groups[0]["params"][0], float("nan")
-        )
+    for parameter in (optimizer.param_groups[0]["params"][0] for optimizer in optimizers):
+        parameter.grad = torch.full_like(parameter, float("nan"))
     before = [number for optimizer in optimizers for number in numbers_of(optimizer)]
     with torch.no_grad():
         assert AdamTable(CPU).step(work_of(optimizers), torch.tensor(1.0))

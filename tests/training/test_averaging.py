@@ -31,9 +31,7 @@ CALM = {
 @pytest.fixture(scope="module")
 def ready(tiny_scene, tmp_path_factory) -> NrfgsTrainer:
     """A trainer before its first step, whose optimisers have made one."""
-    trainer = set_up(
-        command_line("nrfgs", tiny_scene, tmp_path_factory.mktemp("ready"), 10, CALM, {"--average-steps": 4})
-    )
+    trainer = set_up(command_line("nrfgs", tiny_scene, tmp_path_factory.mktemp("r"), 10, CALM, {"--average-steps": 4}))
     a_step(trainer.pipeline.model, trainer.optimizers.optimizers)
     return trainer
 

@@ -61,9 +61,7 @@ def finished(tiny_scene, tmp_path_factory, any_share) -> Path:
 
 
 @pytest.mark.parametrize(("number", "step", "status"), [(signal.SIGTERM, 5, 143), (signal.SIGINT, 9, 130)])
-def test_a_signal_at_any_step_saves_and_the_training_goes_on_to_the_bit(
-    number, step, status, finished, tiny_scene, tmp_path, capsys
-):
+def test_a_training_goes_on_to_the_bit_after_a_signal(number, step, status, finished, tiny_scene, tmp_path, capsys):
     """In a step after which test images are evaluated, and in one within the window of the mean."""
     trainer = ready(tiny_scene, tmp_path / "a")
     at_step(trainer, step, lambda: os.kill(os.getpid(), number))

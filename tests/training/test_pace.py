@@ -116,9 +116,7 @@ def test_a_stretched_training(stretched):
     _, pipeline, _, step = eval_setup(stretched)
     assert step == 19 and pipeline.model.head.active_degree == 3
     assert pipeline.model.schedule_step == 40
-    saved = {
-        step: read(path)["pipeline"]["_model.gauss_params.means"] for step, path in find(models_of(stretched)).items()
-    }
+    saved = {step: read(p)["pipeline"]["_model.gauss_params.means"] for step, p in find(models_of(stretched)).items()}
     counts = {step: len(means) for step, means in saved.items()}
     # 8 training images hold densification back for 8 + 2 steps after the reset at 0: it acts at steps 10, 12 and 14.
     assert counts[3] == counts[9] < counts[12] < counts[15] == counts[18] == pipeline.model.num_points

@@ -316,9 +316,7 @@ def watched_training(scene, out, each_step) -> dict:
 
 def test_a_training_does_not_notice_who_watches(tiny_scene, tmp_path, open_viewer):
     """To the bit: the same training with a browser that looks at something else after every second step."""
-    wishes = [
-        (mode, gain, frozen) for gain, frozen in ((0.0, True), (2.0, False)) for mode in [FULL, *FIELD, VIEW_DEPENDENCE]
-    ]
+    wishes = [(mode, g, f) for g, f in ((0.0, True), (2.0, False)) for mode in [FULL, *FIELD, VIEW_DEPENDENCE]]
     viewers, seen = [], []
 
     def watch(trainer):
