@@ -270,5 +270,5 @@ class Run:
         if error > GOOD_ERROR:
             yield "The error is large: try --camera-model OPENCV, or --camera per-image if the zoom was changed."
         if shortest < SHORTEST:
-            found = f"A focal length is {shortest:.2f} of the longer side, as of hardly any lens"
+            found = f"A focal length is {shortest:.2f} of the longer side, shorter than that of most lenses"
             yield f"{found}: the cameras are probably wrong. Keep the photographs' EXIF, or take more, from the sides."

@@ -52,7 +52,7 @@ def export_ply(load_config: Path, output: Path, options: PlyOptions, measure: bo
     with few_threads() as threads:
         pipeline = load_model(load_config, "test" if measure else "inference")
         threads.suit_to(pipeline)
-        pipeline.model.fit_on(pipeline.datamanager.train_dataset.cameras, options.steps)
+        pipeline.model.fit_on(pipeline.cameras_to_fit, options.steps)
         begin = perf_counter()
         fit = pipeline.model.fit
         seconds = perf_counter() - begin

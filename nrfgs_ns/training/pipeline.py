@@ -4,6 +4,7 @@
 import json
 import random
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -12,6 +13,7 @@ from time import perf_counter
 from typing import Any
 
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import track
@@ -95,7 +97,15 @@ class NrfgsPipeline(VanillaPipeline):
                 photographs = photograph_model(config.model, self.datamanager)
             self.model.learn_photographs(photographs)
         if test_mode == "inference":  # ns-export (and ns-render, which asks for no harmonics)
-            self.model.fit_on(self.datamanager.train_dataset.cameras)
+            self.model.fit_on(self.cameras_to_fit)
+
+    @property
+    def cameras_to_fit(self) -> Cameras:
+        """The training cameras in the size of the training, also where nerfstudio gives them the photographs'."""
+        cameras, parser = deepcopy(self.datamanager.train_dataset.cameras), self.config.datamanager.dataparser
+        if self.test_mode == "inference":
+            cameras.rescale_output_resolution(1 / (getattr(parser, "downscale_factor", None) or 1))
+        return cameras
 
     def _check_smallest_image(self) -> None:
         """Raise InputError where a training's first images are too small for SSIM."""

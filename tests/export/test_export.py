@@ -14,7 +14,7 @@ import torch
 import tyro
 from compact_fields import plain_splats
 from plyfile import PlyData
-from short_trainings import command_line
+from short_trainings import command_line, untrained
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.head import base_colors
@@ -268,6 +268,11 @@ def test_an_antialiased_model_is_marked_as_such(trained, tmp_path, monkeypatch):
         pipeline.model.config.rasterize_mode = mode
         Ply(trained["nrfgs"], output=tmp_path / "s.ply", measure=False).main()
         assert PlyData.read(str(tmp_path / "s.ply")).comments == comments
+
+
+def test_harmonics_are_fitted_in_the_size_of_the_training(tiny_scene, tmp_path):
+    half = untrained(tiny_scene, tmp_path, "nrfgs", "nrfgs-data", "--downscale-factor", 2, mode="inference")
+    assert int(half.cameras_to_fit.width[0]) == 24 and int(half.datamanager.train_dataset.cameras.width[0]) == 48
 
 
 @pytest.mark.parametrize("method", METHODS)

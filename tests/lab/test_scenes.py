@@ -96,9 +96,8 @@ def glossy(tmp_path_factory):
 
 def test_pictures_are_what_nerfstudios_rays_see(matt):
     """Through every pixel centre, with the split that was meant."""
-    parser = NerfstudioDataParserConfig(
-        data=matt, orientation_method="none", center_method="none", auto_scale_poses=False, load_3D_points=False
-    ).setup()
+    options = {"orientation_method": "none", "center_method": "none", "auto_scale_poses": False}
+    parser = NerfstudioDataParserConfig(data=matt, load_3D_points=False, **options).setup()
     scene = build_scene(MATT)
     for split, expected in zip(("train", "test"), split_names(MATT), strict=True):
         outputs = parser.get_dataparser_outputs(split)

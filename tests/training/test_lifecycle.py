@@ -176,10 +176,8 @@ def test_a_training_with_the_line_is_the_one_without(tiny_scene, tmp_path, monke
     spoken = trained(command_line("nrfgs", tiny_scene, tmp_path / "spoken", 12, options, load, SPOKEN))
     assert_same_training(checkpoint_of(quiet), checkpoint_of(spoken), rtol=0.0, atol=0.0)
 
-    lines = [
-        re.match(r"step (\d+) of 12 .* (\d+\.\d) dB on test view (\S+\.png)", line)
-        for line in said.getvalue().splitlines()
-    ]
+    pattern = r"step (\d+) of 12 .* (\d+\.\d) dB on test view (\S+\.png)"
+    lines = [re.match(pattern, line) for line in said.getvalue().splitlines()]
     assert [int(line[1]) for line in lines] == [*range(7, 13), 12] and len({line[3] for line in lines}) == 1
 
 
