@@ -19,6 +19,7 @@ from nrfgs_ns.data.pictures import (
     NUMBERS,
     check_depth,
     exif_of,
+    is_heif,
     naming,
     open_picture,
     read_exif,
@@ -59,7 +60,7 @@ def find_inputs(source: Path) -> list[Path]:
         )
     files = sorted(path for path in source.iterdir() if path.is_file() and not path.name.startswith("."))
     photos = [path for path in files if path.suffix.lower() in PHOTOS]
-    if heif := next((path for path in photos if path.suffix.lower() in HEIF), None):
+    if heif := next(filter(is_heif, photos), None):
         open_picture(heif).close()  # reports a missing pillow-heif before any work
     if len(photos) < FEWEST:
         raise InputError(

@@ -20,7 +20,7 @@ from nrfgs_ns.errors import InputError
 FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP", "PPM")
 """Formats that PIL may open, by a file's first bytes; for some others it would start Ghostscript."""
 HEIF = (".heic", ".heif")
-"""Suffixes of files that may also be HEIF, which pillow-heif reads for PIL."""
+"""Suffixes of HEIF, which pillow-heif reads for PIL."""
 MASK_MODES = ("1", "L", "I", "I;16")
 """PIL modes of masks: one value for each pixel, no palette index."""
 HALF = 127
@@ -42,9 +42,16 @@ def reads_heif() -> bool:
     return True
 
 
+def is_heif(path: Path) -> bool:
+    """Whether a file is HEIF by its suffix, or, whatever its name, by its first bytes."""
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        return path.suffix.lower() in HEIF or file.read(11)[4:] in (b"ftyphei", b"ftypmif", b"ftypmsf")
+    return False
+
+
 def open_picture(path: Path) -> Image.Image:
     """An image whose header alone is read; InputError if it is of no known format."""
-    heif = path.suffix.lower() in HEIF
+    heif = is_heif(path)
     if heif and not reads_heif():
         raise InputError(
             f"{path} is a HEIC photograph, not read here: run `pip install pillow-heif`, or convert it to JPEG."

@@ -98,23 +98,23 @@ def test_a_copy_keeps_what_holds_for_it(tmp_path, suffix):
     assert not gone & {*exif, *exif.get_ifd(ExifTags.IFD.Exif)}
 
 
-def as_heic(capture: Capture, write) -> None:
-    """Rename all images, and write them anew."""
+@pytest.fixture(params=[".heic", ".jpg"])
+def renamed(capture, request) -> list:
     for frame in capture.meta["frames"]:
-        frame["file_path"] = frame["file_path"].replace(".png", ".heic")
-        write(capture.folder / frame["file_path"])
+        frame["file_path"] = frame["file_path"].replace(".png", request.param)
+    return [capture.folder / frame["file_path"] for frame in capture.meta["frames"]]
 
 
-def test_photographs_of_a_data_set_may_be_heic(capture):
+def test_photographs_of_a_data_set_may_be_heic(capture, renamed):
     pillow_heif = pytest.importorskip("pillow_heif", reason="needs pillow-heif")
     flat = Image.new("RGB", (capture.width, capture.height), (9, 99, 199))
-    as_heic(capture, lambda path: pillow_heif.from_pillow(flat).save(path, quality=-1))
+    [pillow_heif.from_pillow(flat).save(path, quality=-1) for path in renamed]
     manager = NrfgsDatamanagerConfig(dataparser=capture.parser(eval_mode="interval").config).setup(device="cpu")
     manager.load_all_images()
     np.testing.assert_allclose(manager.cached_train[0]["image"].int(), flat, atol=2)
 
 
-def test_without_pillow_heif_the_message_says_what_to_install(capture, no_heif):
-    as_heic(capture, lambda path: path.touch())
-    with pytest.raises(InputError, match=r"images/\d+.heic is .*: run `pip install pillow-heif`"):
+def test_without_pillow_heif_the_message_says_what_to_install(capture, renamed, no_heif):
+    [path.write_bytes(b"\0\0\0\x18ftypheic") for path in renamed]
+    with pytest.raises(InputError, match=r"images/\d+.(heic|jpg) is .*: run `pip install pillow-heif`"):
         capture.parse()
