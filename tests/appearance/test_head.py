@@ -138,9 +138,6 @@ def test_one_camera_is_as_good_as_one_for_each_splat(config):
 class Mine(AppearanceHead):
     name = "mine"
 
-    def __init__(self, config):
-        super().__init__()
-
     def forward(self, splats, visible, camera_centers, change=lambda *answer: answer):
         rows = {name: value.view(-1).view(value.shape) for name, value in splats.items()}  # of contiguous tables
         return SplatAppearance(*change(*self.base_appearance(rows, visible)))
@@ -160,7 +157,7 @@ def answering(change):
     (answering(lambda colors, opacities: (colors, opacities[:, None])), r"opacities .*\[2\], but .*\[2, 1\]"),
     (answering(lambda colors, opacities: (colors.half(), opacities)), "colors .*float16"),
     (answering(lambda colors, opacities: (colors / 0, opacities)), "colors .*not all finite"),
-    ({"at_pixel": True, "image_of": lambda _, seen, rays: seen.unfold(1, 8, 8)[..., :2, 0]}, r"image_of .*\[16, 2, 2\]"),
+    ({"at_pixel": True, "image_of": lambda _, made, at: made.unfold(1, 8, 8)[..., :2, 0]}, r"image_of .*\[16, 2, 2\]"),
 ])  # fmt: skip
 def test_a_head_that_breaks_the_contract_is_told_before_the_training(change, says):
     config = NrfgsModelConfig(appearance=AppearanceHeadConfig(_target=type("Mine", (Mine,), change)))
