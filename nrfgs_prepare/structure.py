@@ -60,7 +60,8 @@ def extract_features(
     `cameras` is a list of photographs that share their intrinsics. InputError where the disk lacks room."""
     pycolmap = colmap()
     every = list(itertools.chain(*cameras))
-    needed, free = BYTES_PER_FEATURE * features * len(every), shutil.disk_usage(database.parent).free
+    kept = database.stat().st_size if database.exists() else 0  # of an interrupted run
+    needed, free = BYTES_PER_FEATURE * features * len(every) - kept, shutil.disk_usage(database.parent).free
     if free < needed:  # COLMAP would abort the whole process
         found = f"features may take {needed / 1e6:.1f} MB, and {free / 1e6:.1f} MB are free"
         raise InputError(f"{database.parent}: {found}. Make room, or give a smaller --features.")

@@ -173,7 +173,7 @@ def rates(head: str) -> str:
 
 
 def wider() -> str:
-    """Most that a setting beyond the chosen ones gains, of the network and of the convolutions."""
+    """Most that a setting beyond the chosen ones gains, of the network and of the convolutions: of a higher rate."""
     return " and ".join(signed(max(setting_gains(f"wide-{head}").values()), 2) for head in ("deferred", "latent-spec"))
 
 

@@ -295,7 +295,7 @@ def check_head(head: AppearanceHead, splats: Mapping[str, Tensor]) -> None:
         require(f"{name!r} of splat_params", value, count, *value.shape[1:])
     if count == 0:
         return
-    table = {name: value[:1].expand(count + 2, *value.shape[1:]) for name, value in splats.items()}
+    table = {name: value[:1].expand(count + 2, *value.shape[1:]).contiguous() for name, value in splats.items()}
     answer = head(table, torch.arange(count, count + 2), splats["means"][0] + head.scene_unit)
     if not isinstance(answer, SplatAppearance):
         kind = type(answer).__name__
@@ -303,8 +303,8 @@ def check_head(head: AppearanceHead, splats: Mapping[str, Tensor]) -> None:
     require("opacities of forward, for two splats,", answer.opacities, 2)
     require("colors of forward, for two splats,", answer.colors, 2, answer.colors.shape[-1] if head.at_pixel else 3)
     if head.at_pixel:
-        rays = torch.tensor([[[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]])
-        require("what image_of makes of two pixels", head.image_of(answer.colors[None], rays), 1, 2, 3)
+        picture, rays = answer.colors[0].repeat(16, 16, 1), torch.tensor([0.0, 0.0, 1.0]).repeat(16, 16, 1)
+        require("what image_of makes of 16 x 16 pixels", head.image_of(picture, rays), 16, 16, 3)
 
 
 def layers(*widths: int) -> list[nn.Module]:

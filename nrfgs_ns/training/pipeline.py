@@ -102,9 +102,10 @@ class NrfgsPipeline(VanillaPipeline):
     @property
     def cameras_to_fit(self) -> Cameras:
         """The training cameras in the size of the training, also where nerfstudio gives them the photographs'."""
-        cameras, parser = deepcopy(self.datamanager.train_dataset.cameras), self.config.datamanager.dataparser
-        if self.test_mode == "inference":
-            cameras.rescale_output_resolution(1 / (getattr(parser, "downscale_factor", None) or 1))
+        cameras, parser = deepcopy(self.datamanager.train_dataset.cameras), self.datamanager.dataparser
+        if self.test_mode == "inference" and hasattr(type(parser), "downscale_factor"):  # which nerfstudio has set to 1
+            factor = getattr(parser, "training_factor", parser.config.downscale_factor)
+            cameras.rescale_output_resolution(1 / (factor or 1))
         return cameras
 
     def _check_smallest_image(self) -> None:

@@ -138,11 +138,9 @@ def test_one_camera_is_as_good_as_one_for_each_splat(config):
 class Mine(AppearanceHead):
     name = "mine"
 
-    def __init__(self, config):
-        super().__init__()
-
     def forward(self, splats, visible, camera_centers, change=lambda *answer: answer):
-        return SplatAppearance(*change(*self.base_appearance(splats, visible)))
+        rows = {name: value.view(-1).view(value.shape) for name, value in splats.items()}  # of contiguous tables
+        return SplatAppearance(*change(*self.base_appearance(rows, visible)))
 
 
 def answering(change):
@@ -159,7 +157,7 @@ def answering(change):
     (answering(lambda colors, opacities: (colors, opacities[:, None])), r"opacities .*\[2\], but .*\[2, 1\]"),
     (answering(lambda colors, opacities: (colors.half(), opacities)), "colors .*float16"),
     (answering(lambda colors, opacities: (colors / 0, opacities)), "colors .*not all finite"),
-    ({"at_pixel": True, "image_of": lambda self, features, rays: features[..., :2]}, r"image_of .*\[1, 2, 2\]"),
+    ({"at_pixel": True, "image_of": lambda _, made, at: made.unfold(1, 8, 8)[..., :2, 0]}, r"image_of .*\[16, 2, 2\]"),
 ])  # fmt: skip
 def test_a_head_that_breaks_the_contract_is_told_before_the_training(change, says):
     config = NrfgsModelConfig(appearance=AppearanceHeadConfig(_target=type("Mine", (Mine,), change)))
@@ -167,8 +165,7 @@ def test_a_head_that_breaks_the_contract_is_told_before_the_training(change, say
         config.setup(scene_box=None, num_train_data=1, seed_points=(torch.rand(5, 3), torch.full((5, 3), 100)))
 
 
-coordinate = st.floats(-1e6, 1e6, allow_nan=False, width=32)
-point = st.tuples(coordinate, coordinate, coordinate)
+point = st.tuples(*3 * [st.floats(-1e6, 1e6, allow_nan=False, width=32)])
 
 
 @given(point, point, st.sampled_from([1e-3, 0.01, 1.0]))

@@ -270,9 +270,12 @@ def test_an_antialiased_model_is_marked_as_such(trained, tmp_path, monkeypatch):
         assert PlyData.read(str(tmp_path / "s.ply")).comments == comments
 
 
-def test_harmonics_are_fitted_in_the_size_of_the_training(tiny_scene, tmp_path):
-    half = untrained(tiny_scene, tmp_path, "nrfgs", "nrfgs-data", "--downscale-factor", 2, mode="inference")
-    assert int(half.cameras_to_fit.width[0]) == 24 and int(half.datamanager.train_dataset.cameras.width[0]) == 48
+def test_harmonics_are_fitted_in_the_size_of_the_training(tiny_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr("nrfgs_ns.data.dataparser.MAX_AUTO_RESOLUTION", 30)
+    monkeypatch.setattr("nrfgs_ns.data.dataparser.NrfgsDataParser._resizes", True)
+    for chosen in ((), ("--downscale-factor", 2)):
+        half = untrained(tiny_scene, tmp_path, "nrfgs", "nrfgs-data", *chosen, mode="inference")
+        assert int(half.cameras_to_fit.width[0]) == 24 and int(half.datamanager.train_dataset.cameras.width[0]) == 48
 
 
 @pytest.mark.parametrize("method", METHODS)
