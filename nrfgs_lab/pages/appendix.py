@@ -71,7 +71,7 @@ def changes(trials: dict[str, str], sitting: str) -> str:
 
 
 def trial_changes(sitting: str, middle: bool = False) -> str:
-    """Mean changes by a sitting's trials over splits, dB with their standard error; or medians, and whose SSIM wins."""
+    """Mean changes by a sitting's trials, dB with standard errors over splits; or medians, and where SSIM rises."""
     runs, changes = records("trials"), defaultdict(list)
     for key, one in runs.items():
         at, _, trial = one.get("name", "").partition(": ")

@@ -45,7 +45,7 @@ from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.image.ssim import photometric_loss
 from nrfgs_ns.method_config import nrfgs_sh
-from nrfgs_ns.model.model import Pinholes
+from nrfgs_ns.model.pinholes import Pinholes
 from nrfgs_ns.rasterizer import Pinhole
 from nrfgs_ns.trained.loading import load_training
 from nrfgs_ns.training.guard import TrainingStopped

@@ -25,7 +25,7 @@ from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, Similarity, to_capture
 from nrfgs_ns.export.options import PlyOptions
 from nrfgs_ns.files import whole
 from nrfgs_ns.model.harmonics_fit import PlainSplats
-from nrfgs_ns.model.model import pinhole
+from nrfgs_ns.model.pinholes import pinhole
 from nrfgs_ns.rasterizer import Pinhole, ProjectionOptions, composite_view, project_view
 from nrfgs_ns.threads import few_threads
 from nrfgs_ns.trained.loading import finish, load_model, lost, measure_loss

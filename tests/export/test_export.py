@@ -30,6 +30,7 @@ from nrfgs_ns.image.metrics import psnr
 from nrfgs_ns.model import harmonics_fit, harmonics_tune
 from nrfgs_ns.model.harmonics_fit import STRENGTHS, Moments, Observations, PlainSplats, fit_harmonics, observe
 from nrfgs_ns.model.harmonics_tune import fine_tune
+from nrfgs_ns.model.pinholes import pinhole
 from nrfgs_ns.trained.loading import load_model
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -292,8 +293,6 @@ def test_an_independent_reader_renders_the_models_picture(trained, tmp_path):
     """plyfile's numbers, gsplat's own harmonics, and the model's picture."""
     from gsplat.cuda._torch_impl import _spherical_harmonics
     from gsplat_call import rasterization
-
-    from nrfgs_ns.model.model import pinhole
 
     config = trained["nrfgs-sh"]
     Ply(config, output=tmp_path / "s.ply", measure=False, options=PlyOptions(world="training")).main()

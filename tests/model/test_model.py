@@ -18,7 +18,8 @@ from torch.testing import assert_close
 from nrfgs_ns.appearance.head import Field, SplatAppearance
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.model.model import NrfgsModel, Pinholes, pinhole
+from nrfgs_ns.model.model import NrfgsModel
+from nrfgs_ns.model.pinholes import Pinholes, pinhole
 from nrfgs_ns.model.warmup import warm_up
 from nrfgs_ns.rasterizer import Pinhole, ProjectionOptions, composite, composite_view, project_view, world_to_camera
 

@@ -192,7 +192,7 @@ def test_the_size_of_large_or_smaller_photographs_is_said(tiny_scene, tmp_path, 
 
 
 def test_a_start_takes_one_thread_of_the_cpu(tiny_scene, tmp_path, monkeypatch):
-    """Beside another process many small operations take a hundred times as long with several."""
+    """Beside another process many small operations take many times as long with several."""
     counts, before = [], torch.get_num_threads()
     monkeypatch.setattr(pipeline, "photograph_model", lambda *_: counts.append(torch.get_num_threads()))
     torch.set_num_threads(2)

@@ -23,7 +23,7 @@ from nrfgs_ns.export.web.guide import read_notes, read_tour
 from nrfgs_ns.export.web.page import page
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.image.metrics import psnr
-from nrfgs_ns.model.model import pinhole
+from nrfgs_ns.model.pinholes import pinhole
 from nrfgs_ns.threads import few_threads
 from nrfgs_ns.trained.loading import finish, lost
 
