@@ -84,7 +84,7 @@ class NrfgsInputDataset(InputDataset):
                 f"{path} is {size[0]} x {size[1]}, but its camera {' x '.join(map(str, self._sizes[index]))}. Use the "
                 "image that the pose was computed from, or scale the intrinsics with it; masks are as large."
             )
-        return picture.resize(size, sampling)
+        return picture if picture.size == tuple(size) else picture.resize(size, sampling)
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
         """The image, its mask and its index; InputError if a file cannot be used."""
@@ -264,9 +264,9 @@ def undistorted(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
         "image" [H, W, 3 or 4] of `image_type` (uint8 or float32), "image_idx", and with masks "mask" bool [H, W, 1].
     """
     data = dataset.get_data(index, image_type=image_type)
-    camera = dataset.cameras[index].reshape(())
-    if camera.distortion_params is None or not camera.distortion_params.any():
+    if (distortion := dataset.cameras.distortion_params) is None or not distortion[index].any():
         return data
+    camera = dataset.cameras[index].reshape(())
     intrinsics = camera.get_intrinsics_matrices().numpy()
     K, image, mask = _undistort_image(camera, camera.distortion_params.numpy(), data, data["image"].numpy(), intrinsics)
     data["image"] = torch.from_numpy(image)

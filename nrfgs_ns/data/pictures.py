@@ -121,8 +121,9 @@ def in_parallel(
     read: Callable[[int], Result], sizes: Sequence[tuple[int, int]], what: str, workers: int | None = None
 ) -> Iterator[Result]:
     """Results of `read(0)`, `read(1)`, ..., which decode pictures of these sizes (width, height), on `workers` threads
-    (default: one for each processor), as far as half of the free memory allows. The first failure ends the reading; so
-    does, with InputError, a lack of memory for the largest picture. `what` labels the progress bar."""
+    (default: one for each processor, fewer for small pictures), as far as half of the free memory allows. The first
+    failure ends the reading; so does, with InputError, a lack of memory for the largest picture. `what` labels the
+    progress bar."""
     from nerfstudio.utils.rich_utils import CONSOLE  # slow to import, and not needed by `nrfgs prepare`
 
     width, height = max(sizes, key=math.prod, default=(1, 1))
@@ -132,7 +133,8 @@ def in_parallel(
             f"Decoding an image of {width} x {height} takes about {each / 1e9:.1f} GB of memory, and {free / 1e9:.1f} "
             "are free. Close other programs, or make the images and masks smaller."
         )
-    workers = min(workers or os.cpu_count() or 1, free / (2 * each + 1))
+    helpful = 4 + width * height // 250_000  # threads; more would wait for Python's lock between decodings
+    workers = min(workers or min(os.cpu_count() or 1, helpful), free / (2 * each + 1))
     with ThreadPoolExecutor(max(int(workers), 1)) as pool:
         try:
             yield from track(pool.map(read, range(len(sizes))), what, len(sizes), console=CONSOLE, transient=True)

@@ -11,9 +11,7 @@ not count (`estimate`).
 import functools
 import itertools
 import math
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import torch
@@ -132,14 +130,8 @@ def compare(sightings: Sequence[Sighting], centers: Tensor) -> Pairs:
     distance.fill_diagonal_(torch.inf)
     order = distance.argsort(dim=1)[:, : min(CANDIDATES, len(centers) - 1)].tolist() if len(centers) > 1 else []
     nearest = [[(min(a, b), max(a, b)) for b in row] for a, row in enumerate(order)]
-
-    @functools.cache
-    def shift_of(pair: tuple[int, int]) -> tuple[Tensor, Tensor] | None:
-        return _shift(sightings[pair[0]], sightings[pair[1]])
-
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # compute ahead what is needed unless a pair has too few points
-        list(pool.map(shift_of, {pair for row in nearest for pair in row[:NEIGHBOURS]}))
-    compared = {}
+    shift_of = functools.cache(lambda pair: _shift(*(sightings[photograph] for photograph in pair)))
+    compared = {}  # on one thread: the operations are small, and several threads would wait for Python's lock
     for row in nearest:
         usable = (pair for pair in row if shift_of(pair) is not None)
         compared |= {pair: shift_of(pair) for pair in itertools.islice(usable, NEIGHBOURS)}
@@ -153,14 +145,14 @@ def _shift(first: Sighting, second: Sighting) -> tuple[Tensor, Tensor] | None:
     if min(len(first.points), len(second.points)) < FEWEST_POINTS * FEWEST_REGIONS:
         return None
     place = torch.searchsorted(second.points, first.points).clamp_max(len(second.points) - 1)
-    common = second.points[place] == first.points
-    if int(common.sum()) < FEWEST_POINTS * FEWEST_REGIONS:
+    common = (second.points[place] == first.points).nonzero()[:, 0]
+    if len(common) < FEWEST_POINTS * FEWEST_REGIONS:
         return None
     light = second.light[place[common]] - first.light[common]
     red, green, blue = light.unbind(dim=-1)
     columns = torch.stack([light.mean(dim=-1), red - green, blue - green], dim=-1)
-    region = first.region[common]
-    inside = [columns[region == number] for number in region.unique()]
+    region, order = first.region[common].sort()
+    inside = columns[order].split(region.bincount().tolist())
     medians = [lights.median(dim=0).values for lights in inside if len(lights) >= FEWEST_POINTS]
     if len(medians) < FEWEST_REGIONS:
         return None

@@ -5,7 +5,6 @@ that exposure varies, or if photographs disagree about the same points by more t
 """
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -114,7 +113,7 @@ def compare_photographs(points: Tensor | None, cameras: Cameras, images: Sequenc
             mask = inside if mask is None else mask & inside.to(mask.device)
         return overlap.sight(points, viewmat, K, image, mask)
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(4) as pool:  # more would wait for Python's lock
         viewmats = world_to_camera(cameras.camera_to_worlds)
         sightings = list(pool.map(seen, viewmats, cameras.get_intrinsics_matrices(), images))
     return overlap.compare(sightings, centers)

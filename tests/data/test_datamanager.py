@@ -101,8 +101,8 @@ def test_jpeg_masks_are_halved(capture, factor):
     assert np.array_equal(data.cached_train[0]["mask"][..., 0], inside[factor // 2 :: factor, factor // 2 :: factor])
 
 
-@pytest.mark.parametrize("free, threads", [(10**9, 4), (5 * 16 * 108, 2), (16 * 108, 1)])
-def test_free_memory_bounds_the_threads_that_decode(monkeypatch, free, threads):
+@pytest.mark.parametrize("free, workers, threads", [(1e9, 4, 4), (9000, 4, 2), (16 * 108, 4, 1), (1e9, None, 4)])
+def test_free_memory_and_small_pictures_bound_the_threads_that_decode(monkeypatch, free, workers, threads):
     running, most = set(), []
 
     def read(index):
@@ -111,9 +111,10 @@ def test_free_memory_bounds_the_threads_that_decode(monkeypatch, free, threads):
         barrier.wait(timeout=60)
         running.remove(index)
 
+    monkeypatch.setattr("os.cpu_count", lambda: 64)
     monkeypatch.setattr("nrfgs_ns.data.pictures.free_memory", lambda: free)
     barrier = threading.Barrier(threads)
-    list(in_parallel(read, [(12, 9)] * 12, "Reading", workers=4))
+    list(in_parallel(read, [(12, 9)] * 12, "Reading", workers))
     assert max(most) == threads
     with pytest.raises(InputError, match="image of 9000 x 9000 takes about"):
         list(in_parallel(read, [(12, 9), (9000, 9000)], "Reading"))

@@ -111,8 +111,7 @@ def step_alone(trainer, cameras) -> dict:
                 value.grad = before[name]
         images.append(outputs["rgb"].detach())
         all_losses.append({key: value.detach() for key, value in losses.items()})
-    result = {"rgb": images, "losses": all_losses, "statistics": stats}
-    return result | values_and_gradients(pipeline)
+    return {"rgb": images, "losses": all_losses, "statistics": stats} | values_and_gradients(pipeline)
 
 
 def values_and_gradients(pipeline) -> dict:

@@ -114,8 +114,7 @@ def test_hidden_points_and_dark_or_bright_pixels_are_left_out():
     image[:, 90:] = 0.99
     seen = sight(points, viewmat, K, image)
     assert seen.points.tolist() == [1, 3]  # 0 is behind 1, 2 is too bright, 4 is behind the camera
-    mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
-    assert len(sight(points, viewmat, K, image, mask).points) == 0
+    assert len(sight(points, viewmat, K, image, torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)).points) == 0
 
 
 def test_exif_is_a_start_as_far_as_photographs_agree_with_it():
@@ -125,8 +124,7 @@ def test_exif_is_a_start_as_far_as_photographs_agree_with_it():
     assert slope(pairs, exposure) == pytest.approx(1.0, abs=0.05)
     lies = exposure[torch.randperm(8)] * 5
     assert slope(pairs, lies) < 0.2
-    found = estimate(pairs, lies, places(8)).stops[:, 0]
-    assert (found - (exposure - exposure.mean())).abs().max() < 0.2
+    assert (estimate(pairs, lies, places(8)).stops[:, 0] - (exposure - exposure.mean())).abs().max() < 0.2
 
 
 def test_exif_alone():

@@ -88,8 +88,7 @@ def test_residuals_are_on_the_logit_where_splats_share_their_opacity(tiny_scene,
         options = {"--pipeline.model.densification": strategy}
         if bound is not None:
             options["--pipeline.model.appearance.opacity-bound"] = bound
-        other = ready(tiny_scene, tmp_path / f"{strategy}-{bound}", 1, options)
-        assert other.pipeline.model.head.config == expected
+        assert ready(tiny_scene, tmp_path / f"{strategy}-{bound}", 1, options).pipeline.model.head.config == expected
     alone = NrfConfig(opacity_residual=False)
     assert alone.for_copies() == alone.trusted(0.5) == alone
 

@@ -300,8 +300,7 @@ def test_a_table_that_is_half_changed_is_known():
     splats, optimizers = dict(table.splats), table.optimizers
     assert rows_agree(splats, optimizers, [torch.zeros(5), None, 0.5, torch.tensor(3)])
     assert not rows_agree(splats, optimizers, [torch.zeros(6)])
-    longer = torch.nn.Parameter(torch.zeros(6, 3))
-    assert not rows_agree({**splats, "means": longer}, optimizers, [])
+    assert not rows_agree({**splats, "means": torch.nn.Parameter(torch.zeros(6, 3))}, optimizers, [])
     assert not rows_agree({name: torch.nn.Parameter(torch.zeros(6, 3)) for name in splats}, optimizers, [])
     optimizers["scales"].state[splats["scales"]]["exp_avg"] = torch.zeros(4, 3)
     assert not rows_agree(splats, optimizers, [])

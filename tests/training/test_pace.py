@@ -198,8 +198,7 @@ def test_chosen_steps_are_made_and_resuming_goes_on_to_their_end(tiny_scene, tmp
         r"8 training views: 12 steps, view dependence reduced to 0.29, .*nothing drawn nearer than \d", said
     )
     last = {"--load-dir": models_of(whole)}
-    rest = train_on("rest", 0, last, {"--load-step": 10})
-    assert checkpoint_of(rest)["step"] == checkpoint_of(whole)["step"] == 11
+    assert checkpoint_of(train_on("rest", 0, last, {"--load-step": 10}))["step"] == checkpoint_of(whole)["step"] == 11
     with pytest.raises(InputError, match="end of a training of 12 steps: --max-num-iterations 24 --schedule-steps 30"):
         train_on("again", 0, last)
     with pytest.raises(InputError, match="Go on with --schedule-steps 30"):

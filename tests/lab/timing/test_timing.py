@@ -69,8 +69,7 @@ def test_trainings_and_parts_are_measured_once(tiny_scene, tmp_path, monkeypatch
     lines = run.out.read_text()
     few, many, trained = map(json.loads, lines.splitlines())
     assert not any("failed" in record for record in (few, many, trained))
-    row = 4 * (3 + 3 + 4 + 1 + 3 + 45)
-    assert many["parameters_mb"] - few["parameters_mb"] == pytest.approx(100 * row / 1e6)
+    assert many["parameters_mb"] - few["parameters_mb"] == pytest.approx(100 * 4 * (3 + 3 + 4 + 1 + 3 + 45) / 1e6)
     assert many["moments_mb"] == pytest.approx(2 * many["parameters_mb"])
     assert trained["splats"] == 300 and trained["steps"] == 2 and trained["psnr"] > 5
     run.main()
