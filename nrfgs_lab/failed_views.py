@@ -23,29 +23,34 @@ LEAST_SHOWN = 1.0
 """Contribution from which a view shows a splat, in pixels."""
 NEAR = 0.3, 0.5, 0.8
 """A splat is near if its depth is below this share of the depth of the nearest points in the view."""
+BESIDE = 2.0
+"""Splats beside the cameras were shown closer than this, in nearest depths, and mostly with the mean off the image."""
 
 
-def views_that_show(pipeline) -> tuple[Tensor, Tensor]:
-    """How many training views show each splat, and how many have its mean in their image, int64 [N] each."""
+def seen_in_training(pipeline) -> Tensor:
+    """Of each splat: training views that show it, images with its mean, their share of it, its least depth, [4, N]."""
     model, cameras = pipeline.model, pipeline.datamanager.train_dataset.cameras
-    shown, inside = (torch.zeros(model.num_points, dtype=torch.int64, device=model.device) for _ in range(2))
+    seen = torch.zeros(4, model.num_points, device=model.device)
+    least = torch.full_like(seen[0], torch.inf)
     for index in range(len(cameras)):
         view = model.project(cameras[index : index + 1].to(model.device))
         share = contributions(view.projection, model.field.seen_from(view).opacities)
-        shown[view.visible] += (share > LEAST_SHOWN).long()
         x, y = view.projection.means2d.unbind(-1)
-        width, height = view.projection.width, view.projection.height
-        inside[view.visible] += ((x > 0) & (x < width) & (y > 0) & (y < height)).long()
-    return shown, inside
+        within = (x > 0) & (x < view.projection.width) & (y > 0) & (y < view.projection.height)
+        seen[:, view.visible] += torch.stack([share > LEAST_SHOWN, within, share * within, share])
+        depths = view.projection.depths.where(share > LEAST_SHOWN, torch.inf)
+        least[view.visible] = least[view.visible].minimum(depths)
+    return torch.stack([*seen[:2], seen[2] / seen[3], least])
 
 
 @torch.no_grad()
 def failed_views(pipeline) -> dict[str, dict[str, float]]:
     """PSNR of each test view without each kind of suspects, in dB: image name -> what is left out -> PSNR."""
     model, data = pipeline.model, pipeline.datamanager
-    shown, inside = views_that_show(pipeline)
-    suspects = {"shown by 1": shown <= 1, "in 1 image": inside <= 1}
+    shown, inside, framed, least = seen_in_training(pipeline)
     points, result = model.seed_points[0].to(model.device), {}
+    close = least < BESIDE * nearest_depth(points, data.train_dataset.cameras.to(model.device))
+    suspects = {"shown by 1": shown <= 1, "in 1 image": inside <= 1, "beside": close & (framed < 0.5)}
     pairs = zip(data.eval_dataset.image_filenames, data.fixed_indices_eval_dataloader, strict=True)
     for name, (camera, batch) in pairs:
         camera = camera.to(model.device)
@@ -54,7 +59,7 @@ def failed_views(pipeline) -> dict[str, dict[str, float]]:
         nearest = nearest_depth(points, camera)
         near = {f"nearer than {share}": depths < share * nearest for share in NEAR}
         row = result[Path(name).name] = {}
-        for left_out, chosen in {"nothing": torch.zeros_like(inside, dtype=torch.bool), **near, **suspects}.items():
+        for left_out, chosen in {"nothing": torch.zeros_like(close), **near, **suspects}.items():
             field = model.field._replace(splats={key: value[~chosen] for key, value in model.field.splats.items()})
             outputs = model.render(field, camera, field)
             row[left_out] = psnr(outputs["rgb"], model.truth_of(batch, outputs["background"]), model.mask_of(batch))

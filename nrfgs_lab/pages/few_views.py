@@ -11,7 +11,6 @@ from nrfgs_lab.bench.spec import OWN
 from nrfgs_lab.pages.runs import VIEWS, Trainings, grid, mean, records, signed, trainings, view_gains
 
 FIELD, HOST, SAME = "nrfgs", "splatfacto", "harmonics, same rules"
-SHRUNK = "harmonics, same steps and shrinkage"
 FEW = list(VIEWS)[1:]
 SPARSE = {"24_views_bonsai": (24, "22.60"), "kitchen": (21, "19.24 (other views)")}
 """Scene of results/twenty-four.json -> training views, and 3DGS's PSNR with 24 at one eighth of the size, from other
