@@ -19,7 +19,7 @@ from nrfgs_lab.bench.table import grid as grid
 
 ROOT = Path(__file__).resolve().parents[2]
 RUN = re.compile(
-    r"runs/(?P<run>.+)-(?P<strategy>own|original|(original|splatfacto|mcmc|error-guided)@\d+)-(?P<scene>[^-]+)-(?P<seed>\d+)"
+    r"runs/(?P<run>.+)-(?P<strategy>own|(original|splatfacto|mcmc|error-guided)(@\w+)?)-(?P<scene>[^-]+)-(?P<seed>\d+)"
 )
 """Names of a benchmark's records. An underscore stands for a space."""
 VIEWS = {"bonsai": 255, "goldcape": 74, "caliterra": 65, "fox": 43, "castle": 26, "kitchen": 21, "fern": 17}
