@@ -236,8 +236,7 @@ def split(splats: Splats, optimizers: Optimizers, rows: Tensor, places: Tensor) 
         return second[taken:]
 
     def clear(table: Tensor) -> None:
-        table[rows] = 0.0
-        table[places] = 0.0
+        table[torch.cat([rows, places])] = 0.0
 
     if new == 0:
         for name, parameter in splats.items():
