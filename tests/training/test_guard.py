@@ -42,32 +42,25 @@ def start(tiny_scene, tmp_path):
 
 def poison(trainer, at: int, name: str, value: float, row: int = 7) -> None:
     """Put a value into the gradient of a per-splat tensor, or into the loss if the name is "loss", at one step."""
-    model, original = trainer.pipeline.model, trainer.pipeline.get_train_loss_dict
+    model, original, check = (
+        trainer.pipeline.model,
+        trainer.pipeline.get_train_loss_dict,
+        trainer.guard.before_optimizers,
+    )
 
     def spoilt(step, *how):
         outputs, losses, metrics = original(step, *how)
         if step == at and name == "loss":
             losses["main_loss"] = losses["main_loss"] * value
             model.watched["loss main_loss"] = losses["main_loss"].detach()
-        elif step == at:
-            hit = torch.zeros_like(model.gauss_params[name])
-            hit[row] = value
-            # Adds 0 to the loss and `hit` to the gradient.
-            losses["main_loss"] = losses["main_loss"] + _Plant.apply(model.gauss_params[name], hit)
         return outputs, losses, metrics
 
-    trainer.pipeline.get_train_loss_dict = spoilt
+    def checked(*args):
+        if trainer.guard.step == at and name != "loss":
+            model.gauss_params[name].grad[row] = value
+        check(*args)
 
-
-class _Plant(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, parameter, gradient):
-        ctx.save_for_backward(gradient)
-        return parameter.new_zeros(())
-
-    @staticmethod
-    def backward(ctx, grad):
-        return ctx.saved_tensors[0], None
+    trainer.pipeline.get_train_loss_dict, trainer.guard.before_optimizers = spoilt, checked
 
 
 def checkpoints(trainer) -> dict[int, dict]:
