@@ -32,7 +32,7 @@ def seen_in_training(pipeline) -> Tensor:
     model, cameras = pipeline.model, pipeline.datamanager.train_dataset.cameras
     seen = torch.zeros(4, model.num_points, device=model.device)
     least = torch.full_like(seen[0], torch.inf)
-    for index in range(len(cameras)):
+    for index in range(len(pipeline.datamanager.cached_train)):  # which crops the cameras where lenses distort
         view = model.project(cameras[index : index + 1].to(model.device))
         share = contributions(view.projection, model.field.seen_from(view).opacities)
         x, y = view.projection.means2d.unbind(-1)
@@ -48,7 +48,7 @@ def failed_views(pipeline) -> dict[str, dict[str, float]]:
     """PSNR of each test view without each kind of suspects, in dB: image name -> what is left out -> PSNR."""
     model, data = pipeline.model, pipeline.datamanager
     shown, inside, framed, least = seen_in_training(pipeline)
-    points, result = model.seed_points[0].to(model.device), {}
+    points, result = (model.seed_points or [model.means[:0]])[0].to(model.device), {}
     close = least < BESIDE * nearest_depth(points, data.train_dataset.cameras.to(model.device))
     suspects = {"shown by 1": shown <= 1, "in 1 image": inside <= 1, "beside": close & (framed < 0.5)}
     pairs = zip(data.eval_dataset.image_filenames, data.fixed_indices_eval_dataloader, strict=True)

@@ -27,13 +27,10 @@ def test_no_private_name_is_lost(place):
     assert [name for name in lost if f"self.{name}" not in getsource(owner)] == []
 
 
-def test_the_versions_are_known():
+def test_the_versions_are_known_and_another_gsplat_is_refused(monkeypatch):
     assert version("nerfstudio") == host.NERFSTUDIO, "read the names of host.py in this version, then say so there"
     assert version("viser") == host.VISER
     assert version("gsplat").split("+")[0] == ".".join(map(str, host.gsplat_version())) in host.GSPLAT
-
-
-def test_another_gsplat_is_refused(monkeypatch):
     monkeypatch.setattr(host, "gsplat_version", lambda: (1, 6, 0))
     with pytest.raises(ImportError, match="gsplat 1.6.0 is not known here; use 1.4.0 or 1.5.3"):
         run_module("nrfgs_ns.rasterizer.gsplat_cuda")

@@ -72,10 +72,6 @@ def test_every_file_of_the_packages_is_in_it_and_entry_points_name_some(wheel):
         assert not name or re.search(rf"^(class |def )?{name}\b", source.decode(), re.MULTILINE), (module, name)
 
 
-def test_metadata_is_complete(about):
-    assert about["Version"] == __version__ and about["Author"] and about["License-Expression"] == "Apache-2.0"
-
-
 def imported(package: str) -> set[str]:
     """Top-level names of other packages that a package imports anywhere."""
     names = set()
@@ -107,6 +103,7 @@ def test_the_lock_has_versions_that_are_asked_for(about):
         assert pins and all(requirement.specifier.contains(pin) for pin in pins), name
 
 
-def test_citation_and_changelog_are_of_this_version():
+def test_metadata_citation_and_changelog_are_of_this_version(about):
+    assert about["Version"] == __version__ and about["Author"] and about["License-Expression"] == "Apache-2.0"
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))["version"] == __version__
     assert re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)[1] == __version__

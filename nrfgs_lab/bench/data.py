@@ -127,17 +127,18 @@ def select_views(folder: Path, out: Path, scene: Scene) -> None:
 
 def _halve(meta: dict, folder: Path, out: Path) -> None:
     """Halve the frames' images and their cameras."""
-    size = meta["w"] // 2, meta["h"] // 2
     for frame in meta["frames"]:
+        size = [{**frame, **meta}[side] // 2 for side in ("w", "h")]
         for key in {"file_path", "mask_path"} & frame.keys():
             target = out / frame[key]
             target.parent.mkdir(parents=True, exist_ok=True)
             with Image.open(folder / frame[key]) as picture:
                 small = picture.convert("RGB" if key == "file_path" else "L").resize(size, Image.Resampling.BOX)
                 small.save(target, quality=QUALITY)
-    for keys, factor in ((("fl_x", "cx"), size[0] / meta["w"]), (("fl_y", "cy"), size[1] / meta["h"])):
-        meta |= {key: meta[key] * factor for key in keys}
-    meta |= {"w": size[0], "h": size[1]}
+    for lens in [meta] if "w" in meta else meta["frames"]:
+        for side, keys in (("w", ("fl_x", "cx")), ("h", ("fl_y", "cy"))):
+            half = lens[side] // 2
+            lens |= {**{key: lens[key] * (half / lens[side]) for key in keys}, side: half}
     if "ply_file_path" in meta:
         shutil.copy(folder / meta["ply_file_path"], out / meta["ply_file_path"])
 

@@ -133,11 +133,10 @@ def average(rows: list[Row]) -> Row:
 
 
 def with_averages(rows: list[Row]) -> list[Row]:
-    """Rows, followed by an average for each run and strategy if there are several scenes."""
-    kinds = list(dict.fromkeys((row.strategy, row.run) for row in rows))
-    if len({row.scene for row in rows}) < 2:
-        return rows
-    return rows + [average([row for row in rows if (row.strategy, row.run) == kind]) for kind in kinds]
+    """Rows, followed by an average for each run and strategy that has all scenes, if there are several."""
+    kinds, scenes = dict.fromkeys((row.strategy, row.run) for row in rows), {row.scene for row in rows}
+    of_kinds = [[row for row in rows if (row.strategy, row.run) == kind] for kind in kinds]
+    return rows + [average(of_kind) for of_kind in of_kinds if len(of_kind) == len(scenes) > 1]
 
 
 def ranks(rows: list[Row], column: Column) -> dict[int, int]:

@@ -20,6 +20,7 @@ from nrfgs_ns.appearance.reduce import build, latent_basis, with_components, wit
 from nrfgs_ns.compact.rate import Density, Rounded, bits_of_places
 from nrfgs_ns.compact.tables import COLUMNS, MOST_BITS, Grid, morton, splats_of, steps_of, tables_of
 from nrfgs_ns.data.views import camera_spacing
+from nrfgs_ns.errors import InputError
 from nrfgs_ns.model.harmonics_fit import look_through
 from nrfgs_ns.model.loss import photometric
 
@@ -158,7 +159,8 @@ def fine_tune(
         size: bytes of the tables to arrive at, with whatever rate; `rate` begins. None: `rate` stays.
 
     Returns:
-        the field; the grids' steps for each table's columns, on which its numbers lie; and the last rate.
+        the field; the grids' steps for each table's columns, on which its numbers lie; and the last rate. InputError
+        where no splat would be left.
     """
     model, data = pipeline.model, pipeline.datamanager
     view_count = len(data.cached_train)  # before the cameras: undistortion crops them while it loads the images
@@ -176,11 +178,10 @@ def fine_tune(
     rates = RATES | {"means": RATES["means"] * model.scene_unit}
     if len(latents := coded.tables["latents"].values) > 1:
         rates["latents"] *= float(latents.detach().std(dim=0, correction=0).max())
-    densities = [*coded.density.parameters(), *coded.density_of_latents.parameters()]
     groups = [
         *({"params": [table.values], "lr": rates[name]} for name, table in coded.tables.items()),
         {"params": [table.log_steps for table in coded.tables.values()], "lr": STEPS_RATE},
-        {"params": densities, "lr": DENSITY_RATE},
+        {"params": [*coded.density.parameters(), *coded.density_of_latents.parameters()], "lr": DENSITY_RATE},
         {"params": list(head.parameters()), "lr": FIELD_RATE},
     ]
     optimizer = torch.optim.Adam(groups, eps=1e-15)
@@ -199,6 +200,8 @@ def fine_tune(
             growth, loss = growth_without(model, Field(head, splats_of(tables)), views)
             # The training's loss is about the root of the squared error.
             kept = (turns != prunings.index(step)) | (0.5 * loss * growth > cost)
+            if not kept.any():
+                raise InputError("No splat is worth its bytes. Give a smaller --rate, or a larger --size-mb.")
             coded.keep(kept, optimizer)
             turns = turns[kept]
         camera, batch = data.next_train(step)

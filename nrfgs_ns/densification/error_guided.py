@@ -142,7 +142,7 @@ class ErrorGuidedDensification(Densification):
         split(splats, optimizers, torch.cat([parents, grown]), places)
         source = torch.cat([torch.arange(count, device=dead.device).index_copy(0, places, parents), grown])
         self.take_rows(source, count)
-        stored = torch.sigmoid(splats["opacities"].detach()) - DECAY * (1 - min(step / self.end, 1.0))
+        stored = torch.sigmoid(splats["opacities"].detach()) - DECAY * (1 - min(step / max(self.end, 1), 1.0))
         splats["opacities"].data.copy_(torch.logit(stored.clamp(1e-6, 1 - torch.finfo(stored.dtype).eps)))
         if self.verbose:
             print(f"Step {step}: {len(places)} GSs replaced, {len(grown)} split. Now having {count + len(grown)} GSs.")
@@ -236,8 +236,7 @@ def split(splats: Splats, optimizers: Optimizers, rows: Tensor, places: Tensor) 
         return second[taken:]
 
     def clear(table: Tensor) -> None:
-        table[rows] = 0.0
-        table[places] = 0.0
+        table[torch.cat([rows, places])] = 0.0
 
     if new == 0:
         for name, parameter in splats.items():

@@ -32,7 +32,6 @@ STRATEGY_BOUNDS = ("refine_start_iter", "refine_stop_iter", "refine_scale2d_stop
 class GradientConfig(DensificationConfig):
     """Options that splatfacto's and 3DGS's rules share."""
 
-    counts: ClassVar[tuple[str, ...]] = ("budget",)
     stop_split_at: int = 15_000
     """step at which growth ends"""
     reset_alpha_every: int = 30
@@ -181,7 +180,7 @@ class GradientDensification(Densification):
         """Grow and prune by gsplat's rules, and begin the statistics anew."""
         strategy, state = self.strategy, self.state
         count, gradients = len(splats["means"]), state["grad2d"] / state["count"].clamp_min(1)
-        threshold = self._threshold_for_budget(step, count) if self.budget else self.threshold
+        threshold = self._threshold_for_budget(step, gradients) if self.budget else self.threshold
         strategy.grow_grad2d, strategy.grow_scale2d = threshold, self.widest
         growing = gradients > threshold
         if step < strategy.refine_scale2d_stop_iter:
@@ -203,19 +202,18 @@ class GradientDensification(Densification):
                 state[name].zero_()
         torch.cuda.empty_cache()
 
-    def _threshold_for_budget(self, step: int, count: int) -> float:
+    def _threshold_for_budget(self, step: int, gradients: Tensor) -> float:
         """The gradient above which splats grow now, for as many as the budget by the end of growth.
 
         Where the number is off its `course`, the logarithm of the threshold moves, by at most `LARGEST_STEP`. No more
         splats grow by their gradient than bring the number to its course; wide ones may be split besides.
         """
-        state = self.state
+        state, count = self.state, len(gradients)
         goal = self.course(step, count, self.strategy.refine_start_iter, self.strategy.refine_stop_iter)
         if abs(count - goal) > DEAD_BAND * goal:
             move = math.log(count / goal)
             state[THRESHOLD] += max(-LARGEST_STEP, min(move, LARGEST_STEP))
         threshold, room = self.threshold * math.exp(state[THRESHOLD]), max(round(goal) - count, 0)
-        gradients = state["grad2d"] / state["count"].clamp_min(1)
         if room < count:  # the threshold is exclusive
             threshold = max(threshold, gradients.kthvalue(count - room).values.item())
         return threshold

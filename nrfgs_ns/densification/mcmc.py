@@ -28,7 +28,6 @@ class Mcmc(DensificationConfig):
     name: ClassVar[str] = "mcmc"
     copies_splats: ClassVar[bool] = True
     regularises: ClassVar[bool] = True
-    counts: ClassVar[tuple[str, ...]] = ("budget",)
     opacity_seen: OpacitySeen = "peak"
     """opacity by which splats are pruned, moved or replaced (docs/deviations.md). base: stored. peak: largest shown
     lately"""

@@ -89,7 +89,7 @@ class DensificationConfig(ABC):
     """adds terms for opacity and size to the loss, in place of the model's `shrinkage`"""
     shrinkage: ClassVar[float] = 0.0
     """weight that it adds to the model's `shrinkage`, in percent, however many training views there are"""
-    counts: ClassVar[tuple[str, ...]] = ()
+    counts: ClassVar[tuple[str, ...]] = ("budget",)
     """options that are numbers of splats"""
     opacity_seen: OpacitySeen = "base"
     """opacity by which splats are pruned, moved or replaced (docs/deviations.md). base: stored. peak: largest shown

@@ -44,7 +44,6 @@ class ShardedModel(NrfgsModel):
         if self.trimming is not None:
             raise InputError("pipeline.model.robust_loss is for one device. Leave it out.")
         self.view_noise = ViewNoise(0.0, self.view_noise.seed + comm.rank())  # each device has other splats
-        self.sizes: list[tuple[int, int]] = []
 
     def _strategy(self) -> Densification:
         config = self.config.densification.share_of(comm.rank(), comm.world())
@@ -70,9 +69,13 @@ class ShardedModel(NrfgsModel):
         super().learn_photographs(None if states[0] is None else PhotographModel.from_state(states[0]))
 
     @property
+    def num_splats(self) -> int:
+        return sum(self.counts)
+
+    @property
     def parameter_bytes(self) -> int:
-        row = sum(value[:1].numel() * value.element_size() for value in self.gauss_params.values())
-        return row * sum(self.counts) + sum(weight.numel() * weight.element_size() for weight in self.head.parameters())
+        row = sum(value.shape[1:].numel() * value.element_size() for value in self.gauss_params.values())
+        return row * self.num_splats + sum(weight.numel() * weight.element_size() for weight in self.head.parameters())
 
     # Rendering.
 
@@ -124,7 +127,7 @@ class ShardedModel(NrfgsModel):
         if not self.training:
             return losses
         over_splats = {*self.densification.regularisation(self.gauss_params), *shrinkage(self, self.gauss_params)}
-        share = self.num_points * comm.world() / sum(self.counts)
+        share = self.num_points * comm.world() / self.num_splats
         for name in over_splats & losses.keys():
             if self.num_points == 0:
                 del losses[name]
@@ -174,10 +177,6 @@ class ShardedModel(NrfgsModel):
             "height": height,
             "n_cameras": comm.world(),
         }
-
-    @torch.no_grad()
-    def get_metrics_dict(self, outputs, batch) -> dict[str, Any]:
-        return {**super().get_metrics_dict(outputs, batch), "gaussian_count": sum(self.counts)}
 
     # Checkpoints.
 

@@ -83,9 +83,7 @@ def rebalance(
     count, leaving = counts[rank], sum(sent)
     device = splats["means"].device
     going = torch.arange(leaving, device=device) * count // max(leaving, 1)
-    staying = torch.ones(count, dtype=torch.bool, device=device)
-    staying[going] = False
-    staying = staying.nonzero().squeeze(1)
+    staying = torch.ones(count, dtype=torch.bool, device=device).index_fill(0, going, False).nonzero().squeeze(1)
 
     def moved(rows: Tensor) -> Tensor:
         arrived = comm.swap(rows.index_select(0, going), sent, received)

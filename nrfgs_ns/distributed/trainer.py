@@ -63,8 +63,7 @@ class ShardedPipeline(NrfgsPipeline):
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
         """Every device renders every test image, each from its splats and those of the others: the same numbers."""
-        result = super().get_average_eval_image_metrics(step, output_path if comm.rank() == 0 else None, get_std)
-        return {**result, "splats": sum(self.model.counts)}
+        return super().get_average_eval_image_metrics(step, output_path if comm.rank() == 0 else None, get_std)
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore the order of the cameras; torch's generators differ between devices, and go on as they are."""
@@ -109,7 +108,7 @@ class ShardedGuard(Guard):
         return sizes
 
     def _check_visibility(self) -> None:
-        """Nothing: one device's shard may be empty or out of sight."""
+        """Nothing: one device's shard may be out of sight."""
 
     def settle(self) -> None:
         try:

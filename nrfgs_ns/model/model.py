@@ -138,6 +138,11 @@ class NrfgsModel(ExportedModel):
         return groups
 
     @property
+    def num_splats(self) -> int:
+        """Splats on all devices; `num_points` are those on this one."""
+        return self.num_points
+
+    @property
     def parameter_bytes(self) -> int:
         """Bytes that a renderer needs (`Field.bytes`)."""
         return self.field.bytes
@@ -359,7 +364,7 @@ class NrfgsModel(ExportedModel):
         error = (outputs["rgb"] - truth).square().mean(dim=-1, keepdim=True)
         mask = self.mask_of(batch)
         mse = error.mean() if mask is None else (error * mask).sum() / mask.sum()
-        metrics = {"psnr": -10.0 * torch.log10(mse), "gaussian_count": self.num_points}
+        metrics = {"psnr": -10.0 * torch.log10(mse), "gaussian_count": self.num_splats}
         self.camera_optimizer.get_metrics_dict(metrics)
         return metrics
 

@@ -99,6 +99,7 @@ class Guard:
         if not settled_later or step % PARAMETERS_EVERY == 0:
             self.settle()
         self.step = step
+        self._check_number()
         self._check_visibility()
         if step % PARAMETERS_EVERY == 0:
             self.check_parameters(optimizers)
@@ -122,13 +123,16 @@ class Guard:
         if sizes.is_cuda:
             self._send_home(self._verdict)
 
-    def _check_visibility(self) -> None:
-        """Raise TrainingStopped where no splat is left, or none was visible in the last `PATIENCE` steps: no rows, or,
-        in recorded steps, where all splats have one, no pairs of splats and tiles."""
-        if self.model.num_points == 0:
+    def _check_number(self) -> None:
+        """Raise TrainingStopped where no splat is left, on any device."""
+        if self.model.num_splats == 0:
             message = f"No splat is left in step {self.step}: all were pruned. Images or masks show nothing, or "
             message += "thresholds of the densification are too high."
             raise TrainingStopped(message, self.step, "nothing visible", savable=False)
+
+    def _check_visibility(self) -> None:
+        """Raise TrainingStopped where no splat was visible in the last `PATIENCE` steps: no rows, or, in recorded
+        steps, where all splats have one, no pairs of splats and tiles."""
         info = getattr(self.model, "info", {})
         rows = info.get("gaussian_ids")
         blind = rows is not None and (len(rows) == 0 or info.get("pairs") == 0)
@@ -172,9 +176,10 @@ class Guard:
 
     def check_parameters(self, optimizers: LeanOptimizers) -> None:
         """Remove the splats that are not finite and raise TrainingStopped, savable unless a shared weight is not finite
-        either."""
+        either, or no splat is left."""
+        self._check_number()
         named = {name: value for name, value in self.pipeline.named_parameters() if value.numel() > 0}
-        sizes = torch.stack([size.float() for size in torch._foreach_norm(list(named.values()), math.inf)]).tolist()
+        sizes = [size.item() for size in torch._foreach_norm(list(named.values()), math.inf)] if named else []
         findings = [
             (name.removeprefix("_model."), size, named[name].detach())
             for name, size in zip(named, sizes, strict=True)
@@ -184,14 +189,14 @@ class Guard:
             return
         largest = torch.finfo(torch.float32).max
         message = report(self.pipeline, self.step, findings, largest)
-        only_splats = all(name.startswith("gauss_params.") for name, _, _ in findings)
-        if only_splats:
-            good = torch.stack([_within(values, largest) for _, _, values in findings]).all(0)
-            take_rows(self.model, optimizers.optimizers, good.nonzero()[:, 0])
+        splats = [_within(values, largest) for name, _, values in findings if name.startswith("gauss_params.")]
+        kept = torch.stack(splats).all(0).nonzero()[:, 0] if len(splats) == len(findings) else ()
+        if savable := len(kept) > 0:
+            take_rows(self.model, optimizers.optimizers, kept)
             message += f"\nThe checkpoint of step {self.step} is this state without them; with --load-dir, it goes on."
         else:
             message += "\nNothing has been written: the checkpoint before, if there is one, is the last good state."
-        raise TrainingStopped(message, self.step, "parameter", savable=only_splats)
+        raise TrainingStopped(message, self.step, "parameter", savable)
 
 
 def report(pipeline, step: int, findings: Findings, limit: float) -> str:

@@ -193,7 +193,7 @@ class NrfgsPipeline(VanillaPipeline):
                 spread = torch.tensor(values, dtype=torch.float64)  # statistics.stdev takes no infinity
                 result[f"{metric}_std"] = float(spread.std()) if len(values) > 1 else None
         seconds = fmean(image["seconds_per_image"] for image in per_image[1:] or per_image)
-        result |= {"seconds_per_image": seconds, "fps": 1.0 / seconds, "splats": self.model.num_points}
+        result |= {"seconds_per_image": seconds, "fps": 1.0 / seconds, "splats": self.model.num_splats}
         result["parameter_bytes"] = self.model.parameter_bytes
         if get_std:
             result["per_image"] = per_image

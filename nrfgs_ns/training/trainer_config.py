@@ -154,9 +154,9 @@ class NrfgsTrainerConfig(TrainerConfig):
             raise InputError(f"{self.get_base_dir()} cannot be written: {error}. Name another --output-dir.") from error
 
     def _take_a_folder(self) -> None:
-        """Make a folder for this training alone, numbering a name that is taken; a training that goes on from
-        checkpoints in its own folder keeps that."""
-        if self.load_dir is not None and self.load_dir.resolve() == self.get_checkpoint_dir().resolve():
+        """Make a folder for this training alone, numbering a name that is taken; a training that goes on from the last
+        checkpoint in its own folder keeps that."""
+        if (self.load_dir and self.load_dir.resolve(), self.load_step) == (self.get_checkpoint_dir().resolve(), None):
             return
         name = self.timestamp
         for number in count(2):

@@ -197,7 +197,7 @@ def vdgs_by_hand(head, splats, visible, centers):
     return torch.stack(colors), torch.stack(opacities)
 
 
-def test_vdgs_matches_the_formulas():
+def test_vdgs_matches_the_formulas_and_shows_what_the_view_takes_from_opacity():
     head = awake(VdgsConfig())
     splats, visible, centers = scene(head, count=18)
     assert (splats["means"][visible].abs() > 1).any() and (splats["means"][visible] < 0).any()
@@ -205,10 +205,6 @@ def test_vdgs_matches_the_formulas():
     expected_colors, expected_opacities = vdgs_by_hand(head, splats, visible, centers)
     assert_close(colors, expected_colors, rtol=0, atol=1e-12)
     assert_close(opacities, expected_opacities, rtol=0, atol=1e-12)
-
-
-def test_what_the_view_takes_from_opacity_can_be_shown():
-    head = awake(VdgsConfig())
     splats, visible, centers = scene(head)
     parts = head.components(splats, visible, centers)
     change = parts["opacity residual"]

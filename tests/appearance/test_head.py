@@ -119,19 +119,14 @@ def test_values_are_bounded_and_every_stored_number_is_felt(config):
         assert (value.grad[visible] != 0).any(dim=0).all(), name
 
 
-def test_nothing_visible(config):
+def test_nothing_visible_is_nothing_and_one_camera_is_as_good_as_one_for_each_splat(config):
     head = awake(config)
-    splats, _, _ = scene(head)
+    splats, visible, viewed = scene(head)
     for centers in (torch.zeros(3).double(), torch.zeros(0, 3).double()):
         colors, opacities = head(splats, torch.zeros(0, dtype=torch.int64), centers)
         assert colors.shape == (0, 3) and opacities.shape == (0,)
-
-
-def test_one_camera_is_as_good_as_one_for_each_splat(config):
-    head = awake(config)
-    splats, visible, centers = scene(head)
-    one = head(splats, visible, centers[0])
-    each = head(splats, visible, centers[:1].expand(len(visible), 3))
+    one = head(splats, visible, viewed[0])
+    each = head(splats, visible, viewed[:1].expand(len(visible), 3))
     assert torch.equal(one.colors, each.colors) and torch.equal(one.opacities, each.opacities)
 
 

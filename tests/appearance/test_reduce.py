@@ -21,11 +21,18 @@ def case(request):
     return random_field(CONFIGS[request.param])
 
 
-def test_full_rank_is_the_head(case):
+def test_full_rank_is_the_head_and_latents_in_a_subspace_need_no_more(case):
     field, visible, centers = case
     whole = with_rank(field, latent_basis(field, torch.rand(40)), 8)
     assert (whole.splats["latents"] - field.splats["latents"]).abs().max() > 0.01, "the basis must have turned"
     assert_same(whole, field, visible, centers)
+    torch.manual_seed(0)
+    flat = torch.randn(40, 3) @ torch.randn(3, 8) * 0.5 + torch.randn(8)
+    field = Field(field.head, {**field.splats, "latents": flat})
+    small = with_rank(field, latent_basis(field, torch.ones(40)), 3)
+    assert small.splats["latents"].shape == (40, 3) and small.head.config.latent_dim == 3
+    assert_same(small, field, visible, centers, atol=1e-4)  # numbers up to 5 here, 2^-24 of them 60 times
+    assert small.bytes < field.bytes
 
 
 def test_components_predict_the_hidden_units_better_the_more_there_are(case):
@@ -52,14 +59,3 @@ def test_components_predict_the_hidden_units_better_the_more_there_are(case):
             axes, _ = torch.linalg.qr(torch.randn(8, rank, dtype=torch.float64))
             codes = torch.linalg.lstsq(first @ axes, (centred @ first.T).T).solution
             assert error((axes @ codes).T) >= errors[rank - 1] * (1 - 1e-9)
-
-
-def test_latents_in_a_subspace_need_no_more(case):
-    field, visible, centers = case
-    torch.manual_seed(0)
-    flat = torch.randn(40, 3) @ torch.randn(3, 8) * 0.5 + torch.randn(8)
-    field = Field(field.head, {**field.splats, "latents": flat})
-    small = with_rank(field, latent_basis(field, torch.ones(40)), 3)
-    assert small.splats["latents"].shape == (40, 3) and small.head.config.latent_dim == 3
-    assert_same(small, field, visible, centers, atol=1e-4)  # numbers up to 5 here, 2^-24 of them 60 times
-    assert small.bytes < field.bytes

@@ -304,6 +304,7 @@ def test_a_size_that_is_too_small_is_refused_with_the_smallest_and_so_are_other_
         ("--size-mb nan", "must be"),
         ("--finetune -1", "--finetune is -1"),
         ("--rate nan", "--rate is nan"),
+        ("--rate 10 --finetune 20", "smaller --rate"),
     ):
         with pytest.raises(InputError, match=said):
             tyro.cli(Export, args=[*words, *options.split()]).main()

@@ -167,13 +167,15 @@ def test_a_budget_decides_how_many_splats_there_are_when_growth_ends(budget):
 
 
 def test_opacities_decay_less_and_less():
-    taken = []
-    for step in (600, 15_000, 24_800):
-        table, strategy = Table(5), rules()
+    """And no more once a paced training (`Pace.step_at`) is beyond the end."""
+    taken, steps = [], (600, 15_000, 24_800, 40_000)
+    for step in steps:
+        table, strategy = Table(5), rules(stop_at=50_000)
+        strategy.reschedule(lambda position, now=step: position if position > now else 0)
         strategy.state[WIDTH] = torch.full((5,), 0.5)
         table.step(strategy, step)
         taken.append(0.5 - torch.sigmoid(table.splats["opacities"][0]).item())
-    assert taken == pytest.approx([DECAY * (1 - step / 30_000) for step in (600, 15_000, 24_800)], abs=1e-6)
+    assert taken == pytest.approx([DECAY * max(1 - step / 30_000, 0) for step in steps], abs=1e-6)
 
 
 def test_growth_ends_at_the_cap_and_in_time():

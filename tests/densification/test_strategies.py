@@ -201,10 +201,9 @@ def test_growth_ends_at_the_budget(name, budget):
 
 
 def test_the_threshold_follows_the_course_in_small_steps():
-    rules = strategy("original", budget=1000)
-    rules.state["grad2d"], rules.state["count"] = torch.zeros(1000), torch.ones(1000)
-    assert rules._threshold_for_budget(500, 100) == pytest.approx(rules.threshold)  # on course
-    assert rules._threshold_for_budget(7700, 100) == pytest.approx(rules.threshold * math.exp(-0.12))  # far behind
+    rules, grown = strategy("original", budget=1000), torch.zeros(100)
+    assert rules._threshold_for_budget(500, grown) == pytest.approx(rules.threshold)  # on course
+    assert rules._threshold_for_budget(7700, grown) == pytest.approx(rules.threshold * math.exp(-0.12))  # behind
 
 
 def test_a_budget_goes_on_from_a_checkpoint():

@@ -100,7 +100,7 @@ def fits_one_process(scene: Path, folder: Path) -> None:
 
 
 def stops_together(scene: Path, folder: Path) -> None:
-    """The second device's image has NaN at step 7."""
+    """The second device's image has NaN at step 7; then all splats are pruned, at step 10."""
     from nrfgs_ns.training.guard import TrainingStopped
 
     def break_image(trainer) -> None:
@@ -115,11 +115,13 @@ def stops_together(scene: Path, folder: Path) -> None:
 
         trainer.pipeline.get_train_loss_dict = broken
 
-    try:
-        train(scene, folder / "stopped", dist.get_world_size(), 10, watch=break_image, **PLAIN)
-        said = ""
-    except TrainingStopped as stopped:
-        said = str(stopped)
+    said = []
+    pruned = {"--pipeline.model.densification": "splatfacto,warmup_length=1,refine_every=2,cull_alpha_thresh=0.49"}
+    for name, how in (("stopped", {"watch": break_image}), ("pruned", pruned)):
+        try:
+            train(scene, folder / name, dist.get_world_size(), 14, **PLAIN | how)
+        except TrainingStopped as stopped:
+            said.append(str(stopped))
     torch.save(said, folder / f"stopped-{dist.get_rank()}.pt")
 
 

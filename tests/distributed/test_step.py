@@ -32,16 +32,12 @@ def results(request, two_devices):
     return tuple(torch.load(two_devices / f"{request.param}-{who}.pt") for who in (0, 1, "alone"))
 
 
-def test_every_device_renders_its_own_camera(results):
+def test_every_device_renders_its_own_camera_and_has_its_loss(results):
     first, second, alone = results
     assert first["rgb"].shape != second["rgb"].shape
     for ours, theirs in zip((first, second), alone["rgb"], strict=True):
         agree("rgb", ours["rgb"], theirs)
         assert float(theirs.std()) > 0.02, "an image without contents proves nothing"
-
-
-def test_losses(results):
-    first, second, alone = results
     for name in alone["losses"][0]:
         mine, theirs = torch.stack([part["losses"][name] for part in (first, second)]), alone["losses"]
         theirs = torch.stack([losses[name] for losses in theirs])
@@ -50,7 +46,7 @@ def test_losses(results):
         agree(name, mine, theirs)
 
 
-def test_gradients_of_splats_arrive_where_they_live(results):
+def test_gradients_of_splats_arrive_where_they_live_and_those_of_shared_weights_are_whole(results):
     first, second, alone = results
     assert alone["gradients"].keys() == first["gradients"].keys()
     for name, theirs in alone["gradients"].items():
@@ -58,10 +54,6 @@ def test_gradients_of_splats_arrive_where_they_live(results):
         for rank, ours in enumerate((first, second)):
             agree(name, ours["splats"][name], alone["splats"][name][rank::2])
             agree(name, ours["gradients"][name], theirs[rank::2])
-
-
-def test_gradients_of_shared_weights_are_whole(results):
-    first, second, alone = results
     for name, theirs in alone["shared"].items():
         for ours in (first, second):
             assert (ours["shared"][name] is None) == (theirs is None), name

@@ -87,10 +87,11 @@ def test_both_devices_report_what_one_process_would(two_devices):
         assert first[name] == pytest.approx(alone[name], rel=1e-4), name
 
 
-def test_one_device_s_nan_stops_all_with_its_message(two_devices):
+def test_one_device_s_nan_stops_all_with_its_message_and_so_do_splats_that_are_gone(two_devices):
     first, second = (torch.load(two_devices / f"stopped-{rank}.pt") for rank in (0, 1))
     assert first == second
-    assert first.startswith("On device 1 of 2: Training stopped at step 7: loss main_loss has NaN")
+    assert first[0].startswith("On device 1 of 2: Training stopped at step 7: loss main_loss has NaN")
+    assert first[1].startswith("No splat is left in step 11: all were pruned")
     content = checkpoint(next((two_devices / "stopped").rglob("nerfstudio_models")))
     assert content["step"] == 7
     assert all(torch.isfinite(value).all() for value in splats_of(content).values())

@@ -99,7 +99,10 @@ def test_a_tour_of_photographs_or_of_a_camera_path(tmp_path):
     ({"tour": [CAMERA, {}]}, r"tour\[1\].position"),
     ({"tour": [CAMERA, CAMERA | {"target": [1, 2, 3]}]}, "equal"),
     ({"tour": [CAMERA, CAMERA | {"position": [1, 2, float("nan")]}]}, "position"),
+    ({"tour": [CAMERA, CAMERA | {"up": [0, 1]}]}, r"tour\[1\].up"),
+    ({"tour": [CAMERA, CAMERA | {"fov": 40, "aspect": 0}]}, r"tour\[1\].aspect is 0"),
     (PATH | {"camera_type": "fisheye"}, "fisheye"),
+    (PATH | {"camera_path": [FRAMES[0], FRAMES[1] | {"fov": 180}]}, "fov is 180"),
     (PATH | {"camera_path": [FRAMES[0], FRAMES[1] | {"camera_to_world": POSE[:12]}]}, "camera_to_world"),
     (PATH | {"camera_path": [FRAMES[0], {"camera_to_world": POSE}]}, "fov"),
 ])  # fmt: skip

@@ -223,6 +223,9 @@ def test_notes_are_at_their_points_and_are_text(wall):
     assert np.allclose(page.camera()[0], VIEWS[0]["position"])
     page.page.get_by_role("button", name="Note 1", exact=True).click()
     assert page.page.get_by_text("<b>left</b> & right").is_hidden()
+    for fault in ({"text": "x", "camera": VIEWS[0]}, notes[0] | {"position": [1, 2]}):
+        with pytest.raises(playwright.Error, match="position must be 3 finite numbers"):
+            page.call("setNotes", [fault])
     assert page.call("getNotes") == notes
 
 

@@ -51,20 +51,17 @@ def test_values_are_those_of_other_libraries(height, width, noise):
         assert ms_ssim(pred, gt) == pytest.approx(expected, abs=1e-5)
 
 
-def test_inverted_contrast_is_worth_nothing():
-    """Negative contrast-structure terms are clamped: a power of them would not be a number."""
-    _, gt = pair(170, 190)
-    expected = pytorch_msssim.ms_ssim(batch(1 - gt), batch(gt), data_range=1.0).item()
-    assert ms_ssim(1 - gt, gt) == pytest.approx(expected, abs=1e-6) == 0.0
-
-
-def test_perfect_and_diverged_predictions():
+def test_perfect_inverted_and_diverged_predictions():
     _, gt = pair(170, 165)
     values = image_metrics(gt, gt)
     assert values["psnr"] == pytest.approx(100.0) and values["l1"] == 0.0  # capped: JSON has no infinity
     # In float32 cs and ssim are quotients of equal numbers, each rounded once or twice.
     assert values["ssim"] == pytest.approx(1.0, abs=1e-6) and values["ms_ssim"] == pytest.approx(1.0, abs=1e-6)
     json.dumps(values, allow_nan=False)
+    # Negative contrast-structure terms are clamped: a power of them would not be a number.
+    _, gt = pair(170, 190)
+    expected = pytorch_msssim.ms_ssim(batch(1 - gt), batch(gt), data_range=1.0).item()
+    assert ms_ssim(1 - gt, gt) == pytest.approx(expected, abs=1e-6) == 0.0
     pred, gt = pair(170, 170)
     pred[80, 80] = float("nan")
     assert all(math.isnan(metric(pred, gt)) for metric in SCALARS)
@@ -81,13 +78,17 @@ def test_small_images_give_a_number_or_none(height, width, masked):
     assert values["ms_ssim"] is None and values["lpips"] is None
 
 
-def test_an_empty_mask_gives_none_and_one_without_a_window_no_ssim():
+def test_an_empty_mask_gives_none_and_one_without_a_window_no_ssim_but_a_thin_one_survives_the_coarse_scales():
     pred, gt = pair(170, 165)
     mask = torch.zeros(170, 165, 1, dtype=torch.bool)
     assert set(image_metrics(pred, gt, mask).values()) == {None}
     mask[:5] = True
     assert psnr(pred, gt, mask) is not None and l1(pred, gt, mask) is not None
     assert ssim(pred, gt, mask) is None and ms_ssim(pred, gt, mask) is None
+    pred, gt = pair(200, 220)
+    mask = torch.zeros(200, 220, 1, dtype=torch.bool)
+    mask[:, 101] = True  # one pixel wide, odd: gone after one halving by majority
+    assert 0 < ms_ssim(pred, gt, mask) < 1
 
 
 def test_what_lies_outside_the_mask_does_not_count():
@@ -107,13 +108,6 @@ def test_masked_ssim_is_the_mean_over_centres_inside():
     ssim_map = ssim_maps(*(image.movedim(-1, 0) for image in (filled, gt)))[0]
     expected = np.mean([ssim_map[:, i - 5, j - 5].mean() for i, j, _ in mask.nonzero().tolist()])
     assert ssim(pred, gt, mask) == pytest.approx(expected, abs=1e-12)
-
-
-def test_a_thin_mask_survives_the_coarse_scales():
-    pred, gt = pair(200, 220)
-    mask = torch.zeros(200, 220, 1, dtype=torch.bool)
-    mask[:, 101] = True  # one pixel wide, odd: gone after one halving by majority
-    assert 0 < ms_ssim(pred, gt, mask) < 1
 
 
 @pytest.mark.gpu

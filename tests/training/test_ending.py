@@ -230,16 +230,18 @@ def test_another_scene_other_options_and_another_method_are_refused(finished, ti
 
 
 def test_trainings_of_one_name_have_a_folder_each(tiny_scene, tmp_path):
-    """Those of one second, too; a training that goes on in its own folder stays there."""
+    """Those of one second, too; a training that goes on in its own folder stays there, unless from an older step: its
+    checkpoints would be removed as older than those that are there."""
     config = parse(command_line("nrfgs", tiny_scene, tmp_path, 1))
     configs = [replace(config, timestamp="mine") for _ in range(3)]
     for each in configs:
         each.save_config()
         assert (each.get_base_dir() / "config.yml").is_file()
     assert [each.get_base_dir().name for each in configs] == ["mine", "mine_2", "mine_3"]
-    on = replace(config, timestamp="mine", load_dir=configs[0].get_checkpoint_dir())
-    on.save_config()
-    assert on.timestamp == "mine"
+    for step, name in ((None, "mine"), (0, "mine_4")):
+        on = replace(config, timestamp="mine", load_dir=configs[0].get_checkpoint_dir(), load_step=step)
+        on.save_config()
+        assert on.timestamp == name
 
 
 def test_what_ns_train_says_before_it_begins(tiny_scene, tmp_path, monkeypatch, capsys):

@@ -28,8 +28,8 @@ FULL_SIZE = {"--pipeline.model.num-downscales": 0}
 def start(tiny_scene, tmp_path):
     """A trainer that is ready for its first step; `fused` makes its CPU optimisers skip like those on a GPU."""
 
-    def trainer(*more: dict, steps: int = 10, fused: bool = False):
-        trainer = set_up(command_line("nrfgs", tiny_scene, tmp_path, steps, FULL_SIZE, *more))
+    def trainer(*more: dict, steps: int = 10, fused: bool = False, method: str = "nrfgs"):
+        trainer = set_up(command_line(method, tiny_scene, tmp_path, steps, FULL_SIZE, *more))
         if fused:
             for optimizer in trainer.optimizers.optimizers.values():
                 for group in optimizer.param_groups:
@@ -42,32 +42,25 @@ def start(tiny_scene, tmp_path):
 
 def poison(trainer, at: int, name: str, value: float, row: int = 7) -> None:
     """Put a value into the gradient of a per-splat tensor, or into the loss if the name is "loss", at one step."""
-    model, original = trainer.pipeline.model, trainer.pipeline.get_train_loss_dict
+    model, original, check = (
+        trainer.pipeline.model,
+        trainer.pipeline.get_train_loss_dict,
+        trainer.guard.before_optimizers,
+    )
 
     def spoilt(step, *how):
         outputs, losses, metrics = original(step, *how)
         if step == at and name == "loss":
             losses["main_loss"] = losses["main_loss"] * value
             model.watched["loss main_loss"] = losses["main_loss"].detach()
-        elif step == at:
-            hit = torch.zeros_like(model.gauss_params[name])
-            hit[row] = value
-            # Adds 0 to the loss and `hit` to the gradient.
-            losses["main_loss"] = losses["main_loss"] + _Plant.apply(model.gauss_params[name], hit)
         return outputs, losses, metrics
 
-    trainer.pipeline.get_train_loss_dict = spoilt
+    def checked(*args):
+        if trainer.guard.step == at and name != "loss":
+            model.gauss_params[name].grad[row] = value
+        check(*args)
 
-
-class _Plant(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, parameter, gradient):
-        ctx.save_for_backward(gradient)
-        return parameter.new_zeros(())
-
-    @staticmethod
-    def backward(ctx, grad):
-        return ctx.saved_tensors[0], None
+    trainer.pipeline.get_train_loss_dict, trainer.guard.before_optimizers = spoilt, checked
 
 
 def checkpoints(trainer) -> dict[int, dict]:
@@ -164,12 +157,13 @@ def test_a_splat_that_is_not_finite_is_named_and_left_out(start):
     start({"--load-dir": trainer.checkpoint_dir}).train()
 
 
-def test_weights_that_are_not_finite_are_never_written_nor_read(start):
+@pytest.mark.parametrize("name", ["head.low.0.weight", "gauss_params.quats"])
+def test_weights_or_all_splats_that_are_not_finite_are_never_written_nor_read(name, start):
     trainer = start(steps=2)
     trainer.train()
     ((step, state),) = checkpoints(trainer).items()
-    trainer.pipeline.model.head.low[0].weight.data[0, 0] = NAN
-    with pytest.raises(TrainingStopped, match="head.low.0.weight has NaN"):
+    trainer.pipeline.model.get_parameter(name).data[:, 0] = NAN
+    with pytest.raises(TrainingStopped, match=f"(?s){name} has NaN.*Nothing has been written"):
         trainer.save_checkpoint(5)
     assert set(checkpoints(trainer)) == {step}
     state["pipeline"]["_model.gauss_params.means"].view(-1)[4] = INF
@@ -221,9 +215,11 @@ def test_a_training_in_which_nothing_is_visible_stops(start, monkeypatch):
     assert stopped.value.step == 5 and list(checkpoints(trainer)) == [5]
 
 
-def test_a_training_without_splats_stops_and_saves_nothing(start):
+@pytest.mark.parametrize("method, steps", [("nrfgs", 20), ("nrfgs", 11), ("nrfgs-sh", 11)])
+def test_a_training_without_splats_stops_and_saves_nothing(method, steps, start):
+    """Nor at its end, nor a head without weights."""
     strategy = "splatfacto,warmup_length=1,refine_every=2,cull_alpha_thresh=0.49"
-    trainer = start({"--pipeline.model.densification": strategy}, steps=20)
-    with pytest.raises(TrainingStopped, match="No splat is left in step 11: all were pruned") as stopped:
+    trainer = start({"--pipeline.model.densification": strategy}, steps=steps, method=method)
+    with pytest.raises(TrainingStopped, match=f"No splat is left in step {min(steps - 1, 11)}: all were") as stopped:
         trainer.train()
     assert stopped.value.origin == "nothing visible" and not checkpoints(trainer)

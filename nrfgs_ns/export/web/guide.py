@@ -81,9 +81,9 @@ def _tour_in(file: Path) -> dict[str, Any]:
     for i in (round(k * (len(views) - 1) / (count - 1)) for k in range(count)):
         where, view = f"{file}: camera_path[{i}]", views[i] if isinstance(views[i], dict) else {}
         matrix = _numbers(view.get("camera_to_world"), 16, f"{where}.camera_to_world")
-        fov, aspect = _numbers([view.get("fov"), view.get("aspect")], 2, f"{where}: fov and aspect")
         columns = [matrix[4 * row + column] for column in range(4) for row in range(4)]
-        kept.append({"matrix": columns, "fov": fov, "aspect": aspect})
+        kept.append({"matrix": columns, "fov": view.get("fov"), "aspect": view.get("aspect")})
+        _camera(kept[-1], where)
     return {"views": kept, "seconds": seconds, "loop": loop}
 
 
@@ -97,8 +97,10 @@ def _camera(camera: Any, where: str) -> None:
         camera.get("target"), 3, f"{where}.target"
     ):
         raise InputError(f"{where}: target and position are equal. Move the target to what the camera looks at.")
-    if "fov" in camera and not 0 < _numbers([camera["fov"]], 1, f"{where}.fov")[0] < 180:
-        raise InputError(f"{where}.fov is {camera['fov']}; it must lie between 0 and 180 degrees.")
+    _numbers(camera.get("up") or [0, 0, 1], 3, f"{where}.up")
+    for name, most in (("fov", 180), ("aspect", math.inf)):
+        if name in camera and not 0 < _numbers([camera[name]], 1, f"{where}.{name}")[0] < most:
+            raise InputError(f"{where}.{name} is {camera[name]}; it must lie between 0 and {most}.")
 
 
 def _numbers(values: Any, count: int, where: str) -> list[float]:

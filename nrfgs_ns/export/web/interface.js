@@ -70,7 +70,7 @@ function addressOf(camera) {
 // Whether the address asks for a view; one that cannot be read is none.
 function readAddress() {
   const asked = new URLSearchParams(location.hash.slice(1)), index = Number(asked.get("photograph")) - 1;
-  const known = Boolean(photographs[index]);
+  const known = index in photographs;
   if (known) visit(index, 0);
   if (!asked.has("camera")) return known;
   const values = asked.get("camera").split(",").map(Number), fov = asked.has("fov") ? { fov: Number(asked.get("fov")) } : {};
@@ -106,7 +106,8 @@ function offer() {
     setNotes(list) {
       for (const { text, position, camera } of list) {
         if (typeof text !== "string") throw new TypeError("A note's text must be a string.");
-        cameraOf(camera ?? { position, target: plus(position, [1, 0, 0]) });
+        cameraOf({ position, target: plus(position ?? [], [1, 0, 0]) });
+        if (camera) cameraOf(camera);
       }
       setNotes(structuredClone(list));
     },

@@ -51,7 +51,7 @@ def test_rows_beyond_their_budget_are_named():
 
 
 def test_an_average_is_of_rows_that_have_all_scenes():
-    """NRF lacks seed 1 on one scene and failed it on the other; GS has no seed that both scenes have."""
+    """NRF lacks seed 1 on one scene and failed it on the other; GS has no seed that both have, SG one scene."""
     plan = {
         ("s", "SH"): ({1: record(30.0), 2: record(32.0)}, {}),
         ("t", "SH"): ({1: record(20.0), 2: record(22.0)}, {}),
@@ -59,12 +59,15 @@ def test_an_average_is_of_rows_that_have_all_scenes():
         ("t", "NRF"): ({2: record(40.0)}, {1: "missing"}),
         ("s", "GS"): ({1: record(50.0)}, {2: "missing"}),
         ("t", "GS"): ({2: record(50.0)}, {1: "missing"}),
+        ("s", "SG"): ({1: record(60.0)}, {}),
     }
     rows = [Row(*place, "own", records, absent).fill() for place, (records, absent) in plan.items()]
     average = {row.run: row for row in with_averages(rows) if row.scene == "average"}
     assert average["SH"].text(PSNR) == "26.00 ± 1.41"  # of 25 and 27
     assert average["NRF"].absent == {1: "FAILED"} and average["NRF"].text(PSNR) == "40.00"
-    assert average["GS"].mean(PSNR) is None and ranks(list(average.values()), PSNR) == {0: 2, 1: 1}
+    assert (
+        "SG" not in average and average["GS"].mean(PSNR) is None and ranks(list(average.values()), PSNR) == {0: 2, 1: 1}
+    )
 
 
 def test_a_folder_comes_back(tmp_path):

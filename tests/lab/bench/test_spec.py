@@ -222,6 +222,12 @@ def test_held_out_scenes_have_no_test_view_and_the_same_cameras_at_half_the_size
     (other / "transforms.json").write_text(json.dumps({**whole, "train_filenames": names[2:]}))
     again = parser_options(other.parent, Scene("tiny", views=2), tmp_path / "mirrors")[2]
     assert json.loads((Path(again) / "transforms.json").read_text())["train_filenames"][0] == names[2]
+    lens = {key: whole.pop(key) for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")}  # as prepare writes several cameras
+    whole["frames"] = [{**frame, **lens} for frame in whole["frames"]]
+    (source / "transforms.json").write_text(json.dumps(whole))
+    shutil.rmtree(tmp_path / "mirrors")
+    halved = {(frame["w"], frame["fl_x"], frame["cx"]) for frame in made(plan.scenes[0])[1]["frames"]}
+    assert halved == {(meta["w"], meta["fl_x"], meta["cx"])}
     with pytest.raises(InputError, match="holds out none"):
         made(Scene("tiny", held_out=30, held_out_by="place"))
     (source / "transforms.json").write_text(json.dumps({**whole, "train_filenames": []}))

@@ -32,8 +32,12 @@ LINK = re.compile(r"\]\(([^)\s]+)\)")
 
 
 @pytest.mark.parametrize("name", PAGES)
-def test_numbers_are_those_of_the_records(name):
+def test_numbers_are_those_of_the_records_and_files_that_a_page_names_are_there(name):
     assert PAGES[name] == written(PAGES[name]), "write them again: python -m nrfgs_lab.pages.tables --write"
+    paths = re.findall(r"(?<![\w/])(?:nrfgs_\w+|tests|results|docs)/[\w/.-]*\.(?:py|md|json|yaml)\b", PAGES[name])
+    paths = [path for path in paths if "NAME" not in path]
+    paths += [name.replace(".", "/") for name in re.findall(r"python -m (nrfgs_(?:ns|lab)[\w.]*)", PAGES[name])]
+    assert [path for path in paths if not any((ROOT / f"{path}{end}").exists() for end in ("", ".py"))] == []
 
 
 @pytest.mark.parametrize("name", [name for name, text in PAGES.items() if BLOCK.search(text)])
@@ -92,14 +96,6 @@ def test_every_record_is_shown_or_used():
     text = "\n".join([*PAGES.values(), *(path.read_text(encoding="utf-8") for path in sources)])
     used = set(re.findall(r"""["']([\w-]+)["']|results/([\w-]+)\.json|[{ ]([\w-]+)\|""", text))
     assert {path.stem for path in (ROOT / "results").glob("*.json")} <= {stem for names in used for stem in names}
-
-
-@pytest.mark.parametrize("name", PAGES)
-def test_files_that_a_page_names_are_there(name):
-    paths = re.findall(r"(?<![\w/])(?:nrfgs_\w+|tests|results|docs)/[\w/.-]*\.(?:py|md|json|yaml)\b", PAGES[name])
-    paths = [path for path in paths if "NAME" not in path]
-    paths += [name.replace(".", "/") for name in re.findall(r"python -m (nrfgs_(?:ns|lab)[\w.]*)", PAGES[name])]
-    assert [path for path in paths if not any((ROOT / f"{path}{end}").exists() for end in ("", ".py"))] == []
 
 
 @pytest.mark.parametrize("name", FIGURES)
