@@ -154,7 +154,7 @@ class NrfgsTrainer(Trainer):
     def _follow(self, written: dict[str, Any] | None) -> None:
         """Go on from the checkpoint's position on the schedules; the remaining steps walk through the rest."""
         pace = self.pace
-        if pace is None and written is not None:
+        if written is not None and (pace is None or type(pace) is Pace and pace.length != written["length"]):
             same = "a --time-budget" if "seconds" in written else f"--schedule-steps {written['length']}"
             fix = f"Go on with {same}" if self.world_size == 1 else "Go on with one device"
             raise InputError(f"The schedules of the checkpoint's training are stretched. {fix}, or train anew.")

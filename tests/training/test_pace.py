@@ -201,7 +201,8 @@ def test_chosen_steps_are_made_and_resuming_goes_on_to_their_end(tiny_scene, tmp
     assert checkpoint_of(train_on("rest", 0, last, {"--load-step": 10}))["step"] == checkpoint_of(whole)["step"] == 11
     with pytest.raises(InputError, match="end of a training of 12 steps: --max-num-iterations 24 --schedule-steps 30"):
         train_on("again", 0, last)
-    with pytest.raises(InputError, match="Go on with --schedule-steps 30"):
-        train_on("again", 24, last)
+    for other in {}, {"--schedule-steps": 24}:
+        with pytest.raises(InputError, match="Go on with --schedule-steps 30"):
+            train_on("again", 24, last, other)
     more = train_on("more", 14, last, {"--schedule-steps": 30})
     assert checkpoint_of(more)["step"] == 13
