@@ -49,7 +49,7 @@ class Inspect(NamesTraining):
         config = self.config()
         output = self.output or config.parent / "inspect.json"
         check_writable(output, "--output")
-        pipeline = load_model(config, "test")
+        pipeline = load_model(config, "test", measured=True)
         model, cameras = pipeline.model, pipeline.datamanager.train_dataset.cameras
         if not isinstance(model.head, NeuralResidualField):
             raise InputError(f"{config}: the {model.head.name!r} head has no parts. Name a training of nrfgs.")

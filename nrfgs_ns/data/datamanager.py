@@ -140,14 +140,14 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
     def load_all_images(self) -> tuple[int, int]:
         """Decode all images; return the numbers of training and evaluation images. InputError if an image or a mask
         cannot be used, or nothing is visible in any training image."""
-        names = [path.name for path in self.train_dataset.image_filenames]
-        empty = [name for name, data in zip(names, self.cached_train, strict=True) if not _shows_anything(data)]
-        if empty:
-            finding = f"{self.get_datapath()}: masks or transparency leave nothing of {some(empty)}"
-            if len(empty) == len(names):
-                raise InputError(f"{finding}. Masks are 0 outside and 255 inside; opaque pixels have alpha 255.")
-            warn(f"{finding}.")
-        return len(names), len(self.cached_eval)
+        for dataset, images in ((self.train_dataset, self.cached_train), (self.eval_dataset, self.cached_eval)):
+            named = zip(dataset.image_filenames, images, strict=True)
+            if empty := [path.name for path, data in named if not _shows_anything(data)]:
+                finding = f"{self.get_datapath()}: masks or transparency leave nothing of {some(empty)}"
+                if dataset is self.train_dataset and len(empty) == len(images):
+                    raise InputError(f"{finding}. Masks are 0 outside and 255 inside; opaque pixels have alpha 255.")
+                warn(f"{finding}.")
+        return len(self.cached_train), len(self.cached_eval)
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
         """The next `train_view` in turn."""
@@ -172,9 +172,8 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         return index
 
     def _image(self, index: int) -> dict[str, Any]:
-        batch = self.cached_train[index].copy()
-        batch["image"] = batch["image"].to(self.device)
-        return batch
+        batch = self.cached_train[index]
+        return batch | {"image": batch["image"].to(self.device)}
 
     def _view(self, index: int) -> Cameras:
         if index not in self._views:

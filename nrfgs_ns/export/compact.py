@@ -42,7 +42,7 @@ def export_compact(
 ) -> None:
     """Write a compact file, and report its size and loss; see `nrfgs export compact --help`."""
     with few_threads() as threads:
-        pipeline = load_field(load_config)
+        pipeline = load_field(load_config, measure)
         threads.suit_to(pipeline)
         config, numbers = write_file(pipeline, load_config, output, options, measure)
     count, size, ply_size = (numbers[name] for name in ("written", "bytes", "ply_bytes"))
@@ -56,9 +56,9 @@ def export_compact(
     finish(lines, numbers, report)
 
 
-def load_field(load_config: Path) -> NrfgsPipeline:
-    """A trained pipeline; InputError if its head is not a neural residual field."""
-    pipeline = load_model(load_config, "test")
+def load_field(load_config: Path, measured: bool) -> NrfgsPipeline:
+    """A trained pipeline, as by `load_model`; InputError if its head is not a neural residual field."""
+    pipeline = load_model(load_config, "test", measured)
     pipeline.model.head.require_splat_colors()
     if not isinstance(pipeline.model.head, NeuralResidualField):
         raise InputError(

@@ -50,7 +50,7 @@ WORTH_A_WORD = 0.1
 def export_ply(load_config: Path, output: Path, options: PlyOptions, measure: bool, report_file: Path | None) -> None:
     """Write a PLY file, and report what it costs; see `nrfgs export ply --help`."""
     with few_threads() as threads:
-        pipeline = load_model(load_config, "test" if measure else "inference")
+        pipeline = load_model(load_config, "test" if measure else "inference", measure)
         threads.suit_to(pipeline)
         pipeline.model.fit_on(pipeline.cameras_to_fit, options.steps)
         begin = perf_counter()

@@ -76,11 +76,15 @@ def find_data(config: "TrainerConfig", path: Path) -> None:
     config.data = manager.data = manager.dataparser.data = place
 
 
-def load_model(path: Path, mode: Literal["test", "inference"]) -> "NrfgsPipeline":
-    """The pipeline of `load_training`; InputError also if it has no splats."""
+def load_model(path: Path, mode: Literal["test", "inference"], measured: bool = False) -> "NrfgsPipeline":
+    """The pipeline of `load_training`; InputError also if it has no splats, or is to be measured and no test image has
+    pixels inside its mask."""
     pipeline = load_training(path, mode).pipeline
     if pipeline.model.num_points == 0:
         raise InputError(f"{path}: this training has lost all splats. Train again with other options or data.")
+    if measured and all("mask" in data and not data["mask"].any() for data in pipeline.datamanager.cached_eval):
+        fix = "Correct the masks; an export can do without (--no-measure)."
+        raise InputError(f"{path}: no test image has pixels inside its mask: there is nothing to measure on. {fix}")
     return pipeline
 
 
@@ -109,7 +113,7 @@ def load_file(path: Path) -> "NrfgsModel":
 
 @torch.no_grad()
 def measure_loss(pipeline, pictures: Callable[[Any], dict[str, Tensor]]) -> dict[str, Any]:
-    """Compare pictures with the photographs of the test views; InputError if none has pixels inside its mask.
+    """Compare pictures with the photographs of the test views, of which some have pixels inside their masks.
 
     Args:
         pictures: camera -> images [H, W, 3] by name, one of them "file".
@@ -132,8 +136,6 @@ def measure_loss(pipeline, pictures: Callable[[Any], dict[str, Tensor]]) -> dict
             if None not in scores.values():  # None: no pixel inside the mask
                 per_image.append({"image": image, **scores})
             advance()
-    if not per_image:
-        raise InputError("No test image has pixels inside its mask: there is nothing to measure on. Use --no-measure.")
     means = {key: sum(image[key] for image in per_image) / len(per_image) for key in scores}
     return {**means, "loss_db": means["psnr_model"] - means["psnr_file"], "per_image": per_image}
 

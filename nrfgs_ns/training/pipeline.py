@@ -22,7 +22,7 @@ from torchvision.utils import save_image
 
 from nrfgs_ns.appearance.head import AppearanceHead
 from nrfgs_ns.compact.decode import decode, model_state
-from nrfgs_ns.data.checks import warn
+from nrfgs_ns.data.checks import some, warn
 from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
 from nrfgs_ns.densification import statistics
 from nrfgs_ns.errors import InputError
@@ -236,12 +236,14 @@ def print_evaluation(result: Mapping[str, Any]) -> None:
     """Print the means over the test views, the worst view, and how to get LPIPS where it is missing."""
     names = [name for name in SHOWN if result.get(name) is not None]
     views = result["per_image"]
+    known = sorted((view["psnr"], view["image"]) for view in views if view.get("psnr") is not None)
     title = "One test view: not a mean, and no measure of the whole"
-    CONSOLE.print(title if len(views) == 1 else f"Means over {len(views)} test views", soft_wrap=True)
+    CONSOLE.print(title if len(known) == 1 else f"Means over {len(known)} test views", soft_wrap=True)
     table = Table(*(Column(name, justify="right") for name in names))
     table.add_row(*(f"{result[name]:,}" if name == "splats" else f"{result[name]:.4g}" for name in names))
     CONSOLE.print(table)
-    known = sorted((view["psnr"], view["image"]) for view in views if view.get("psnr") is not None)
+    if masked := [view["image"] for view in views if view.get("psnr") is None]:
+        warn(f"Masks leave nothing to measure of {some(masked)}.")
     if len(known) > 1:
         (worst, name), middle = known[0], median(value for value, _ in known)
         worst = f"Median view {middle:.1f} dB. Worst {worst:.1f} dB: {name}. Pictures: --render-output-path FOLDER"

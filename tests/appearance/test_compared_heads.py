@@ -55,8 +55,7 @@ def gsnb_by_hand(head, splats, visible, centers, ramp):
         waves = [[torch.sin(2**k * math.pi * d), torch.cos(2**k * math.pi * d)] for k in range(6)]
         h = torch.cat([d] * head.config.raw_direction + sum(waves, []))
         for layer in (first, second):
-            h = layer.weight @ h + layer.bias
-            h = torch.where(h > 0, h, 0.01 * h)
+            h = torch.nn.functional.leaky_relu(layer.weight @ h + layer.bias, 0.01)
         phi = torch.tanh(third.weight @ h + third.bias)
         k = torch.cat([splats["features_dc"][row][None], splats["features_rest"][row]])
         color = 0.5 + sum((_eval_sh_bases_fast(16, d)[j] + ramp * phi[j]) * k[j] for j in range(16))
@@ -187,8 +186,7 @@ def vdgs_by_hand(head, splats, visible, centers):
         d = (x - center) / (x - center).norm()
         h = torch.cat([d, grid_by_hand(head.grid.table, x)])
         for layer in (first, second):
-            h = layer.weight @ h + layer.bias
-            h = torch.where(h > 0, h, 0.01 * h)
+            h = torch.nn.functional.leaky_relu(layer.weight @ h + layer.bias, 0.01)
         f = 1 / (1 + torch.exp(-(third.weight @ h + third.bias)))
         k = torch.cat([splats["features_dc"][row][None], splats["features_rest"][row]])
         alpha = f[0] / (1 + torch.exp(-splats["opacities"][row, 0]))

@@ -60,16 +60,13 @@ def test_cameras_are_those_of_nerfstudio(capture, split, distortion):
 
 # Splits.
 @pytest.mark.parametrize("kept, other", [("val", {}), ("val", {"test_filenames": []}), ("test", {})])
-def test_val_and_test_stand_in_for_each_other(capture, printed, kept, other):
+def test_val_and_test_stand_in_for_each_other_and_train_for_both(capture, printed, kept, other):
     path = [frame["file_path"] for frame in capture.meta["frames"]]
     capture.meta |= {"train_filenames": path[3:], f"{kept}_filenames": path[:3], **other}
     assert names(capture.parse("train")) == list(range(7))
     assert names(capture.parse("val")) == names(capture.parse("test")) == [7, 8, 9]
     assert "evaluated instead" not in printed()
-
-
-def test_without_eval_images_the_training_images_are_evaluated(capture, printed):
-    capture.meta["train_filenames"] = [frame["file_path"] for frame in capture.meta["frames"][:4]]
+    capture.meta |= {"train_filenames": path[:4], "val_filenames": [], "test_filenames": []}
     assert names(capture.parse("test")) == [6, 7, 8, 9]
     assert "no image is kept for test" in printed()
 

@@ -98,9 +98,11 @@ def test_points_of_hardly_any_spread_start_nothing(tmp_path, spread):
 def test_empty_masks_are_named(tmp_path, printed):
     capture = Capture(tmp_path / "scene", images=10)
     capture.add_masks()
-    Image.new("L", (12, 9)).save(capture.folder / "masks/003.png")
+    for name in ("003.png", "004.png"):  # for training and for testing
+        Image.new("L", (12, 9)).save(capture.folder / "masks" / name)
     datamanager(capture).load_all_images()
-    assert "masks or transparency leave nothing of 003.png" in printed()
+    text = printed()
+    assert all(f"masks or transparency leave nothing of {name}." in text for name in ("003.png", "004.png"))
     for path in (capture.folder / "masks").iterdir():
         Image.new("L", (12, 9)).save(path)
     with pytest.raises(InputError, match="leave nothing of 000.png, 001.png, 002.png and 6 more"):

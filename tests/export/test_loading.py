@@ -2,6 +2,7 @@
 """What is loaded for an export, where its splats lie, and what other programs read of it."""
 
 import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -13,12 +14,14 @@ from scipy.spatial.transform import Rotation
 from short_trainings import command_line, models_of, trained
 from torch.testing import assert_close
 
+from nrfgs_lab.ablation import Inspect
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.export.command import Compact
+from nrfgs_ns.export.command import Compact, Ply, Web
 from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, Similarity
 from nrfgs_ns.export.ply import on_screen, render_splats
+from nrfgs_ns.trained import loading
 from nrfgs_ns.trained.command import View
-from nrfgs_ns.trained.loading import load_training, measure_loss
+from nrfgs_ns.trained.loading import load_training
 from nrfgs_ns.training.checkpoint_files import find
 from nrfgs_ns.training.trainer import end_earlier_logs
 
@@ -61,11 +64,14 @@ def test_a_project_is_read_from_another_folder_and_after_a_move(tiny_scene, tmp_
             load_training(lost, "test")
 
 
-def test_views_of_which_nothing_counts_are_told():
-    """Also before a page is written, which is after the measurement."""
-    data = SimpleNamespace(eval_dataset=SimpleNamespace(image_filenames=[]), fixed_indices_eval_dataloader=[])
-    with pytest.raises(InputError, match="^No test image has pixels inside its mask.*--no-measure"):
-        measure_loss(SimpleNamespace(model=None, datamanager=data), lambda camera: {})
+@pytest.mark.parametrize("command", [Ply, Compact, Web, Inspect])
+def test_views_of_which_nothing_counts_are_told_before_any_work(command, tmp_path, monkeypatch):
+    data = SimpleNamespace(cached_eval=[{"mask": torch.zeros(2, 2, 1, dtype=torch.bool)}])
+    found = SimpleNamespace(pipeline=SimpleNamespace(model=SimpleNamespace(num_points=1), datamanager=data))
+    monkeypatch.setattr(loading, "load_training", lambda *_: found)
+    with pytest.raises(InputError, match="no test image has pixels inside its mask.*--no-measure"):
+        command(Path(__file__), output=tmp_path / "made.html").main()
+    assert not list(tmp_path.iterdir())
 
 
 def camera(similarity: Similarity) -> Cameras:

@@ -20,6 +20,7 @@ from nrfgs_ns.rasterizer.torch_cpu.projection import MIN_QUATERNION
 WIDTH, HEIGHT, FOCAL = 40, 28, 40.0
 NAMES = ("means", "quats", "scales", "opacities", "colors")
 modes = pytest.mark.parametrize("mode", ["classic", "antialiased"])
+everywhere = lambda test: devices(modes(test))  # noqa: E731
 
 
 def cloud(device: str = "cpu", count: int = 6, **planted) -> dict[str, torch.Tensor]:
@@ -62,16 +63,14 @@ def assert_healthy(splats, view=None, **options):
     return image.detach(), alpha.detach(), info
 
 
-@devices
-@modes
+@everywhere
 @pytest.mark.parametrize("depth", [-1.0, 0.0, 0.0099, 0.01, 0.0101, 1e3, 1e6, 9.9e9, 1e10, 1e20])
 def test_depths_from_the_lens_to_beyond_the_far_plane(device, mode, depth):
     _, _, info = assert_healthy(cloud(device, means=[0.0, 0.0, depth]), rasterize_mode=mode)
     assert (0 in info["gaussian_ids"]) == (0.01 <= depth <= 1e10)
 
 
-@devices
-@modes
+@everywhere
 @settings(max_examples=25, derandomize=True)
 @given(exponent=st.floats(-40, 20), shape=st.sampled_from(["ball", "disc", "needle"]), depth=st.floats(-1.9, 4))
 def test_log_scales_from_minus_40_to_plus_20(device, mode, exponent, shape, depth):
@@ -105,8 +104,7 @@ def test_a_splat_without_extent_is_a_point_of_blur():
         assert info["radii"].tolist() == [3]
 
 
-@devices
-@modes
+@everywhere
 @pytest.mark.parametrize("far", [1e6, -1e6, 1e18, -3e38])
 @pytest.mark.parametrize("size", [0.1, 1e6, 1e18])
 def test_far_to_the_side(device, mode, far, size):
@@ -128,8 +126,7 @@ def test_coordinates_of_1e_6_and_1e6(coordinate):
     assert (image[..., :3] - reference).abs().max() < 1e-5
 
 
-@devices
-@modes
+@everywhere
 @pytest.mark.parametrize("length", [0.0, 1e-30, 1e-19, MIN_QUATERNION * 1.01, 1e-10, 1e10, 1e18, 1e25])
 def test_quaternions_of_any_length(device, mode, length):
     """Those whose direction cannot be had are invisible; the others are the unit quaternion."""
@@ -148,8 +145,7 @@ def test_quaternions_of_any_length(device, mode, length):
         assert ((image - unit.detach()).abs().amax(-1) > 4e-5).sum() <= 1
 
 
-@devices
-@modes
+@everywhere
 @pytest.mark.parametrize("opacity", [-1.0, 0.0, 1e-30, 1 / 255, 0.999, 1.0, 1.5])
 def test_opacities_to_both_ends(device, mode, opacity):
     assert_healthy(cloud(device, opacities=opacity), rasterize_mode=mode)
@@ -174,8 +170,7 @@ def test_opacity_of_the_image_rises_with_a_splats(a, b):
     assert (high >= low - 2.0**-22).all()
 
 
-@devices
-@modes
+@everywhere
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("name", NAMES)
 def test_a_splat_that_is_not_finite_is_not_there(device, mode, value, name):
@@ -244,8 +239,7 @@ def test_gsplats_projection_never_sees_an_empty_table(calls, mode, bad):
     (p.means2d.sum() + p.depths.sum() + p.conics.sum()).backward()  # nothing to find, nothing in the way
 
 
-@devices
-@modes
+@everywhere
 @pytest.mark.parametrize("size", [(1, 1), (1, 300), (300, 1)])
 @pytest.mark.parametrize("count", [0, 1, 6])
 def test_images_of_one_pixel_and_scenes_of_no_splat(device, mode, size, count):

@@ -75,7 +75,7 @@ def finished(tiny_scene, tmp_path_factory):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_train_eval_render(method, finished, tmp_path, tiny_scene, recwarn):
+def test_train_eval_render(method, finished, tmp_path, tiny_scene, recwarn, printed):
     config = finished(method)
     results = evaluate(config, tmp_path / "eval.json")
     assert not [warning for warning in recwarn if "degrees of freedom" in str(warning.message)]
@@ -85,12 +85,12 @@ def test_train_eval_render(method, finished, tmp_path, tiny_scene, recwarn):
     assert 8 < results["psnr"] < 40 and 0 < results["ssim"] < 1 and 0 < results["l1"] < 1
     # 48 x 36 is too small for MS-SSIM's five scales, and LPIPS has no weights here: no number, and no crash.
     assert results["ms_ssim"] is None and results["lpips"] is None
-    _, pipeline, path, step = eval_setup(config)
+    _, loaded, path, step = eval_setup(config)
     assert step == STEPS - 1
-    assert results["splats"] == pipeline.model.num_points
-    assert results["parameter_bytes"] == pipeline.model.parameter_bytes
+    assert results["splats"] == loaded.model.num_points
+    assert results["parameter_bytes"] == loaded.model.parameter_bytes
     colors, shared, groups = METHODS[method]
-    assert results["parameter_bytes"] == 4 * (pipeline.model.num_points * (3 + 3 + 4 + 1 + colors) + shared)
+    assert results["parameter_bytes"] == 4 * (loaded.model.num_points * (3 + 3 + 4 + 1 + colors) + shared)
     # Adam's running mean of every tensor that the head adds has moved: it is learning.
     state = checkpoint_of(config)
     for group in groups:
@@ -101,6 +101,8 @@ def test_train_eval_render(method, finished, tmp_path, tiny_scene, recwarn):
 
     if method != "nrfgs":
         return
+    pipeline.print_evaluation(results | {"per_image": [*images, {"image": "hidden.png", "psnr": None}]})
+    assert re.search(r"(?s)Means over 2 test views\b.*nothing to measure of hidden.png", printed())
     ComputePSNR(config, tmp_path / "again.json", render_output_path=tmp_path / "pairs").main()
     assert [file.name[:13] for file in sorted((tmp_path / "pairs").iterdir())] == ["eval_img_0000", "eval_img_0001"]
     DatasetRender(load_config=config, output_path=tmp_path / "renders", image_format="png").main()

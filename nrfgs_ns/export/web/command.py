@@ -45,7 +45,7 @@ def export_web(
         raise InputError(f"--address {web.address} is no web address. Give all of it, with https://.")
     alone = output.suffix.lower() in (".html", ".htm")
     with few_threads() as threads:
-        pipeline = load_field(load_config)
+        pipeline = load_field(load_config, measure)
         names = [Path(name).name for name in pipeline.datamanager.train_dataset.image_filenames]
         guide = {"tour": read_tour(web.tour, names), "notes": read_notes(web.notes), "rotate": web.rotate}
         threads.suit_to(pipeline)
