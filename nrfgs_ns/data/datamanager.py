@@ -137,17 +137,16 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
                 "path in --data or config.yml, and what kind of data set it is."
             ) from error
 
-    def load_all_images(self) -> tuple[int, int]:
-        """Decode all images; return the numbers of training and evaluation images. InputError if an image or a mask
-        cannot be used, or nothing is visible in any training image."""
-        for dataset, images in ((self.train_dataset, self.cached_train), (self.eval_dataset, self.cached_eval)):
-            named = zip(dataset.image_filenames, images, strict=True)
+    def load_all_images(self) -> None:
+        """Decode all images. InputError if an image or a mask cannot be used, or nothing is visible in any training
+        image."""
+        for split, images in ((self.train_dataset, self.cached_train), (self.eval_dataset, self.cached_eval)):
+            named = zip(split.image_filenames, images, strict=True)
             if empty := [path.name for path, data in named if not _shows_anything(data)]:
                 finding = f"{self.get_datapath()}: masks or transparency leave nothing of {some(empty)}"
-                if dataset is self.train_dataset and len(empty) == len(images):
+                if split is self.train_dataset and len(empty) == len(images):
                     raise InputError(f"{finding}. Masks are 0 outside and 255 inside; opaque pixels have alpha 255.")
                 warn(f"{finding}.")
-        return len(self.cached_train), len(self.cached_eval)
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
         """The next `train_view` in turn."""

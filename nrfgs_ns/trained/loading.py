@@ -83,8 +83,7 @@ def load_model(path: Path, mode: Literal["test", "inference"], measured: bool = 
     if pipeline.model.num_points == 0:
         raise InputError(f"{path}: this training has lost all splats. Train again with other options or data.")
     if measured and all("mask" in data and not data["mask"].any() for data in pipeline.datamanager.cached_eval):
-        fix = "Correct the masks; an export can do without (--no-measure)."
-        raise InputError(f"{path}: no test image has pixels inside its mask: there is nothing to measure on. {fix}")
+        raise InputError(f"{path}: no test image has pixels inside its mask. Correct it, or export with --no-measure.")
     return pipeline
 
 

@@ -84,7 +84,8 @@ def test_it_is_what_the_colmap_command_uses(scene):
     own = NrfgsDataParserConfig()
     assert checked(own) is own
     manager = NrfgsDatamanagerConfig(dataparser=ColmapDataParserConfig(data=scene)).setup(device="cpu")
-    assert type(manager.dataparser) is NrfgsColmapDataParser and manager.load_all_images() == (8, 2)
+    assert type(manager.dataparser) is NrfgsColmapDataParser
+    assert (len(manager.cached_train), len(manager.cached_eval)) == (8, 2)
 
 
 def test_cameras_of_several_models(tmp_path):

@@ -24,7 +24,7 @@ def test_images_are_resized_where_there_is_no_folder_of_them(tmp_path, layout):
         config = capture.parser(downscale_factor=2, eval_mode="interval").config
     before = listing(tmp_path / "scene")
     manager = NrfgsDatamanagerConfig(dataparser=config).setup(device="cpu")
-    assert manager.load_all_images() == (8, 2)
+    assert (len(manager.cached_train), len(manager.cached_eval)) == (8, 2)
     assert listing(tmp_path / "scene") == before
     image, cameras = manager.cached_train[0], manager.train_dataset.cameras
     assert image["image"].shape == (4, 6, 3)  # 9 / 2 rounded down
