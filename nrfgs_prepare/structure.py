@@ -5,6 +5,7 @@ COLMAP's database keeps features and matches, so that an interrupted step contin
 """
 
 import itertools
+import math
 import os
 import shutil
 import tempfile
@@ -31,6 +32,8 @@ FEWEST_POINTS = 10
 SEED = 0
 BYTES_PER_FEATURE = 300
 """Room for a feature and its matches in the database."""
+BYTES_PER_PIXEL = 1.0
+"""Room for an undistorted photograph: JPEG of its quality takes up to 0.8."""
 CUT = "was not written whole: the disk may be full. Make room, and run this again."
 
 
@@ -61,10 +64,8 @@ def extract_features(
     pycolmap = colmap()
     every = list(itertools.chain(*cameras))
     kept = database.stat().st_size if database.exists() else 0  # of an interrupted run
-    needed, free = BYTES_PER_FEATURE * features * len(every) - kept, shutil.disk_usage(database.parent).free
-    if free < needed:  # COLMAP would abort the whole process
-        found = f"features may take {needed / 1e6:.1f} MB, and {free / 1e6:.1f} MB are free"
-        raise InputError(f"{database.parent}: {found}. Make room, or give a smaller --features.")
+    needed = BYTES_PER_FEATURE * features * len(every) - kept
+    _check_room(database.parent, needed, "features", "Make room, or give a smaller --features.")
     options = pycolmap.FeatureExtractionOptions(max_image_size=longest_side)
     options.sift.max_num_features = features
     reader = pycolmap.ImageReaderOptions(camera_model=camera_model)
@@ -91,6 +92,13 @@ def extract_features(
             )
             advance(len(part))
     _scale_focal_lengths(database, photos, every)
+
+
+def _check_room(folder: Path, needed: float, what: str, fix: str) -> None:
+    """Raise InputError where the disk lacks room: COLMAP would abort the whole process."""
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        raise InputError(f"{folder}: {what} may take {needed / 1e6:.1f} MB, and {free / 1e6:.1f} MB are free. {fix}")
 
 
 def _scale_focal_lengths(database: Path, photos: Path, names: list[str]) -> None:
@@ -242,11 +250,14 @@ def undistort(model: Path, photos: Path, folder: Path, advance: Advance) -> None
     pycolmap = colmap()
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    pycolmap.undistort_images(folder, model, photos, output_type="COLMAP", jpeg_quality=97)
     distorted = pycolmap.Reconstruction(model)
+    names = [distorted.images[number].name for number in distorted.reg_image_ids()]
+    needed = BYTES_PER_PIXEL * sum(math.prod(read_size(photos / name)) for name in names)
+    _check_room(folder, needed, "undistorted photographs", "Make room, and run this again.")
+    pycolmap.undistort_images(folder, model, photos, output_type="COLMAP", jpeg_quality=97)
     _check_model(folder / "sparse", distorted)
-    for number in distorted.reg_image_ids():
-        path = folder / "images" / distorted.images[number].name
+    for name in names:
+        path = folder / "images" / name
         try:
             read_picture(path)
         except InputError as error:

@@ -209,11 +209,9 @@ def test_interrupted_features_are_taken_up(walls, tmp_path, monkeypatch):
 
 
 # Advice where it fails.
-def test_photographs_that_show_nothing_in_common_are_told(tmp_path):
-    for i in range(3):
-        photo(tmp_path / "photos" / f"{i}.png", (120, 90), ("red", "green", "blue")[i])
+def test_photographs_that_show_nothing_in_common_are_told(three, tmp_path):
     with pytest.raises(InputError, match="no two of the 3 photographs show the same"):
-        run_quietly(tmp_path / "photos", tmp_path / "out")
+        run_quietly(three, tmp_path / "out")
 
 
 def test_global_mapping_helps_out_and_finds_the_same(prepared, walls, tmp_path, monkeypatch):
@@ -310,6 +308,9 @@ def test_what_colmap_could_not_write_whole_is_not_built_on(prepared, tmp_path, m
         monkeypatch.setattr(pycolmap, "undistort_images", cut_one)
         with pytest.raises(InputError, match=f"{found} was not written whole"):
             structure.undistort(work / "model", work / "photos", tmp_path / "cut", lambda steps: None)
+    monkeypatch.setattr(structure.shutil, "disk_usage", lambda _: Mock(free=10_000))
+    with pytest.raises(InputError, match="undistorted photographs may take .* 0.0 MB are free. Make room"):
+        structure.undistort(work / "model", work / "photos", tmp_path / "cut", lambda steps: None)
 
 
 # Collecting.
