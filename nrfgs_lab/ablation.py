@@ -53,9 +53,11 @@ class Inspect(NamesTraining):
         model, cameras = pipeline.model, pipeline.datamanager.train_dataset.cameras
         if not isinstance(model.head, NeuralResidualField):
             raise InputError(f"{config}: the {model.head.name!r} head has no parts. Name a training of nrfgs.")
-        images = pipeline.datamanager.fixed_indices_eval_dataloader
+        pairs = pipeline.datamanager.fixed_indices_eval_dataloader
+        images = [pair for pair in pairs if (mask := model.mask_of(pair[1])) is None or mask.any()]
         if not len(images) or self.views < 1:
-            raise InputError(f"{config}: {self.views} of {len(images)} test views. At least one is needed.")
+            fix = "Give --views 1 or more, and masks that leave something."
+            raise InputError(f"{config}: {self.views} of {len(images)} test views inside masks. {fix}")
         images = [images[i] for i in evenly_spaced(len(images), self.views)]
         with progress(f"Looking at the splats from {len(cameras)} training views"):
             basis = latent_basis(model.field, contributions_to(model, cameras))
@@ -126,12 +128,9 @@ class FieldViews:
 
     @torch.no_grad()
     def psnr(self, field: Field) -> float:
-        """Mean over the views, inside masks, dB; views whose mask is empty are left out."""
-        scores = []
-        for view, truth, mask in self.views:
-            outputs, _ = self.model.composite(view, field.seen_from(view))
-            scores.append(psnr(outputs["rgb"], truth, mask))
-        return fmean([score for score in scores if score is not None] or [0.0])
+        """Mean over the views, inside masks, dB."""
+        pictures = (self.model.composite(view, field.seen_from(view))[0]["rgb"] for view, _, _ in self.views)
+        return fmean(psnr(rgb, truth, mask) for rgb, (_, truth, mask) in zip(pictures, self.views, strict=True))
 
     @torch.no_grad()
     def head_seconds(self, field: Field) -> float:

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("no_cuda")
 SPLIT = NrfConfig(latent_dim=8, hidden_width=16)
 
 
-def test_the_command(tiny_scene, tmp_path, capsys):
+def test_the_command(tiny_scene, tmp_path, capsys, monkeypatch):
     config = trained(command_line("nrfgs", tiny_scene, tmp_path, 4, LOUD))
     tyro.cli(ablation.Inspect, args=["--load-config", str(config), "--views", "2"]).main()
     result = json.loads((config.parent / "inspect.json").read_text())
@@ -32,6 +32,9 @@ def test_the_command(tiny_scene, tmp_path, capsys):
     assert "can be left out together" in capsys.readouterr().out
     with pytest.raises(InputError, match="0 of 2 test views"):
         tyro.cli(ablation.Inspect, args=["--load-config", str(config), "--views", "0"]).main()
+    monkeypatch.setattr("nrfgs_ns.model.model.NrfgsModel.mask_of", lambda *_: torch.zeros(36, 48, 1, dtype=torch.bool))
+    with pytest.raises(InputError, match="12 of 0 test views inside masks"):
+        tyro.cli(ablation.Inspect, args=["--load-config", str(config)]).main()
 
 
 def test_parts_left_out_are_what_their_definition_says():
