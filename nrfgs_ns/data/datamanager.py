@@ -196,12 +196,9 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         budget = free_memory() / 2 if self.config.image_memory is None else 1e9 * self.config.image_memory
         if size <= budget:
             return "memory"
-        CONSOLE.print(
-            f"Decoded images take {size / 1e9:.1f} GB, and may take {budget / 1e9:.1f} (--pipeline.datamanager."
-            f"image-memory): they are read from files in {cache_folder()}.",
-            markup=False,
-            soft_wrap=True,
-        )
+        takes = f"Decoded images take {size / 1e9:.1f} GB, and may take {budget / 1e9:.1f}"
+        option, files = "--pipeline.datamanager.image-memory", f"they are read from files in {cache_folder()}."
+        CONSOLE.print(f"{takes} ({option}): {files}", markup=False, soft_wrap=True)
         return "files"
 
     def _load_images(

@@ -8,6 +8,7 @@ from itertools import count
 from pathlib import Path
 from pkgutil import resolve_name
 
+import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import MAX_AUTO_RESOLUTION
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
@@ -94,6 +95,8 @@ class NrfgsTrainerConfig(TrainerConfig):
             if value is not None and not low <= value < MOST:
                 least = "positive" if low == positive else f"at least {low}"
                 raise InputError(f"{name} is {value}; it must be {least}, and below 2^32.")
+        if devices == 1 and self.machine.device_type == "cuda" and not torch.cuda.is_available():
+            raise InputError("machine.device_type is cuda, but PyTorch finds no GPU (`nrfgs doctor`). Give cpu.")
         if devices > 1 and (self.time_budget or self.schedule_steps) is not None:
             raise InputError("time_budget and schedule_steps are for one device. Leave them out.")
         check_types(self.pipeline, "config.yml", "pipeline.")

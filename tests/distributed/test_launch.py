@@ -22,9 +22,8 @@ from nrfgs_ns.training.checkpoint_files import read_latest
 @pytest.fixture
 def config(tmp_path):
     machine = replace(nrfgs.config.machine, num_devices=2, device_type="cpu")
-    return replace(
-        nrfgs.config, data=tmp_path, output_dir=tmp_path, machine=machine, experiment_name="x", timestamp="now"
-    )
+    named = {"experiment_name": "x", "timestamp": "now"}
+    return replace(nrfgs.config, data=tmp_path, output_dir=tmp_path, machine=machine, **named)
 
 
 KILLED = ProcessExitedException("died", error_index=1, error_pid=7, exit_code=-9, signal_name="SIGKILL")
