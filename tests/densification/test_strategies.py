@@ -40,8 +40,7 @@ def test_every_tensor_of_the_table_goes_along(name):
     if name == "mcmc":
         assert len(table) == 42  # 5 % more
     else:
-        counts = torch.bincount(parents, minlength=30)
-        assert (counts == 2).all()
+        assert (torch.bincount(parents, minlength=30) == 2).all()
         assert {len(value) for value in rules.state.values() if isinstance(value, torch.Tensor)} == {len(table)}
 
 

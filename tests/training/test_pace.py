@@ -204,5 +204,4 @@ def test_chosen_steps_are_made_and_resuming_goes_on_to_their_end(tiny_scene, tmp
     for other in {}, {"--schedule-steps": 24}:
         with pytest.raises(InputError, match="Go on with --schedule-steps 30"):
             train_on("again", 24, last, other)
-    more = train_on("more", 14, last, {"--schedule-steps": 30})
-    assert checkpoint_of(more)["step"] == 13
+    assert checkpoint_of(train_on("more", 14, last, {"--schedule-steps": 30}))["step"] == 13
