@@ -132,8 +132,6 @@ class ErrorGuidedDensification(Densification):
         state, count, self.moved_at = self.state, len(splats["means"]), step
         opacities, wide = self.seen_opacity(splats["opacities"]), state[WIDTH] > WIDEST
         dead = opacities < DEAD
-        if (beside := getattr(self, "beside", None)) is not None:
-            dead, self.beside = dead | beside, None
         parents = draw((opacities * (state[WIDTH] > 0)).masked_fill(dead, 0.0), int(dead.sum()))
         places = dead.nonzero()[:, 0][: len(parents)]
         grown = parents[:0]

@@ -46,9 +46,6 @@ class NrfgsModelConfig(ModelConfig):
     near_plane: Literal["auto", "off"] = "off"
     """auto: draw nothing nearer than half the depth of the capture's nearest points (docs/captures.md). off: nothing
     nearer than 0.01 scene units, as in splatfacto"""
-    beside: str = "off"
-    """trial. draw1: splats nearer than the nearest points are drawn only with their mean in the image. prune2: splats
-    shown nearer than twice that, and mostly with the mean off the image, are replaced every 1,000 steps"""
     warmup_steps: int | None = None
     """steps before training in which a head that starts with a residual unlearns it. None: one for each view"""
     densification: DensificationChoice = field(default_factory=Splatfacto)

@@ -42,7 +42,7 @@ from nrfgs_ns.model.loss import loss_of
 from nrfgs_ns.model.pinholes import Pinholes, pinhole
 from nrfgs_ns.model.saved_state import check_compatible, differences, photographs_of, reduced_config
 from nrfgs_ns.model.warmup import warm_up
-from nrfgs_ns.rasterizer import Pinhole, ProjectionOptions, View, composite_view, contributions, project_view
+from nrfgs_ns.rasterizer import Pinhole, ProjectionOptions, View, composite_view, project_view
 
 NEAR_SHARE = 0.5
 """Near plane of `near_plane` auto, in the depth of the nearest points (`data.views.nearest_depth`)."""
@@ -206,10 +206,8 @@ class NrfgsModel(ExportedModel):
         near, far = (self.scene_unit * plane for plane in (ProjectionOptions.near_plane, ProjectionOptions.far_plane))
         if self.config.near_plane == "auto":
             near = max(near, self.near)
-        framed = 2 * self.near * float(self.config.beside[4:]) if self.config.beside.startswith("draw") else 0.0
         # In training the guard finds numbers that are not finite.
-        mode = self.config.rasterize_mode
-        return ProjectionOptions(mode, near, far, assume_finite=self.training, framed_until=framed)
+        return ProjectionOptions(self.config.rasterize_mode, near, far, assume_finite=self.training)
 
     def _photograph_of(self, camera: Cameras) -> int | None:
         """The photograph whose look a rendering has: in training the camera's own; None: the mean of all."""
@@ -300,9 +298,6 @@ class NrfgsModel(ExportedModel):
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
         cameras = attributes.pipeline.datamanager.train_dataset.cameras
         centers = cameras.camera_to_worlds[:, :3, 3]
-        data = attributes.pipeline.datamanager
-        if self.config.beside.startswith("prune"):
-            self.training_views = [data.train_view(i)[0] for i in range(len(cameras))]
         self.densification.begin(centers, self.num_points, int((cameras.width * cameras.height).max()))
         self.view_noise = ViewNoise(self.noise_factor * camera_spacing(centers), self.view_noise.seed)
 
@@ -358,24 +353,7 @@ class NrfgsModel(ExportedModel):
 
     def step_post_backward(self, step: int) -> None:
         assert step == self.step
-        if self.config.beside.startswith("prune") and step % 1000 == 0 and step > 0:
-            self.densification.beside = self.beside(float(self.config.beside[5:]))
         self.densification.post_backward(step, self.info, self.gauss_params, self.optimizers)
-
-    @torch.no_grad()
-    def beside(self, depth: float) -> Tensor:
-        """Splats shown nearer than `depth` nearest depths, and mostly with the mean off the image, bool [N]."""
-        seen = torch.zeros(2, self.num_points, device=self.device)
-        least = torch.full_like(seen[0], torch.inf)
-        for camera in self.training_views:
-            view = self.project(camera)
-            share = contributions(view.projection, self.field.seen_from(view).opacities)
-            x, y = view.projection.means2d.unbind(-1)
-            within = (x > 0) & (x < view.projection.width) & (y > 0) & (y < view.projection.height)
-            seen[:, view.visible] += torch.stack([share * within, share])
-            depths = view.projection.depths.where(share > 1.0, torch.inf)
-            least[view.visible] = least[view.visible].minimum(depths)
-        return (least < depth * 2 * self.near) & (seen[0] < 0.5 * seen[1])
 
     # Metrics.
 

@@ -14,7 +14,7 @@ kernels on CUDA, `torch_cpu` (plain torch, no compiler) on the CPU.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Literal, NamedTuple
 
@@ -46,8 +46,6 @@ class ProjectionOptions:
     """do not check that splats are finite, which costs a GPU a wait; a training's guard finds those that are not"""
     every_row: bool = False
     """keep invisible splats as rows of radius 0, so that the number of rows is constant; one camera, on CUDA"""
-    framed_until: float = 0.0
-    """depth below which splats are drawn only if their mean is in the image, in world units"""
 
 
 @dataclass
@@ -171,21 +169,7 @@ def project(
         Ks: pinhole intrinsics in pixels, without skew. [C, 3, 3]
         width, height: image size in pixels.
     """
-    result = _backend(means.device, "projection").project(
-        (means, quats, scales), (viewmats, Ks, width, height), options
-    )
-    if options.framed_until <= options.near_plane:
-        return result
-    x, y = result.means2d.detach().unbind(-1)
-    kept = (x > 0) & (x < width) & (y > 0) & (y < height) | (result.depths.detach() >= options.framed_until)
-    if options.every_row:
-        result.radii = result.radii * kept
-        if result.extents is not None:
-            result.extents = result.extents * kept[:, None]
-        return result
-    rows = kept.nonzero()[:, 0]
-    columns = "camera_ids", "gaussian_ids", "radii", "means2d", "depths", "conics", "compensations", "extents"
-    return replace(result, **{n: v.index_select(0, rows) for n in columns if (v := getattr(result, n)) is not None})
+    return _backend(means.device, "projection").project((means, quats, scales), (viewmats, Ks, width, height), options)
 
 
 def composite_view(
