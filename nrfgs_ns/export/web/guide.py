@@ -98,9 +98,9 @@ def _camera(camera: Any, where: str) -> None:
     ):
         raise InputError(f"{where}: target and position are equal. Move the target to what the camera looks at.")
     _numbers(camera.get("up") or [0, 0, 1], 3, f"{where}.up")
-    for name, most in (("fov", 180), ("aspect", math.inf)):
+    for name, most, needed in (("fov", 180, "between 0 and 180 degrees"), ("aspect", math.inf, "positive")):
         if name in camera and not 0 < _numbers([camera[name]], 1, f"{where}.{name}")[0] < most:
-            raise InputError(f"{where}.{name} is {camera[name]}; it must lie between 0 and {most}.")
+            raise InputError(f"{where}.{name} is {camera[name]}; it must be {needed}.")
 
 
 def _numbers(values: Any, count: int, where: str) -> list[float]:
