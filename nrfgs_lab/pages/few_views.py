@@ -22,9 +22,9 @@ MADE = {"glossy": "made", "matt": "made_matt"}
 
 
 def host(scene: str) -> Trainings:
-    """Splatfacto's training of a capture, in results/captures.json or else presets.json."""
-    runs = [one for one in records("captures").values() if (one.get("scene"), one.get("name")) == (scene, HOST)]
-    return runs or trainings("presets", scene, "nerfstudio_splatfacto", OWN)
+    """Splatfacto's trainings of a capture: the first in results/captures.json or presets.json, the others with ours."""
+    first = [one for one in records("captures").values() if (one.get("scene"), one.get("name")) == (scene, HOST)]
+    return (first or trainings("presets", scene, "nerfstudio_splatfacto", OWN)) + today(scene, HOST)
 
 
 def today(scene: str, name: str, strategy: str = OWN) -> Trainings:
@@ -144,14 +144,9 @@ def verdicts(pairs: Mapping[str, Sequence[Trainings]]) -> str:
     return "; ".join(f"{label} {verdict(of)}: {ahead(of)}" for label, of in gains.items())
 
 
-def alone(name: str) -> dict:
-    """A training of `bonsai` alone on a GPU: on `one host`, a `busy host` or `another host`."""
-    return records("trials")[f"{name}/bonsai-42"]
-
-
 def pictured() -> str:
     """Gain over splatfacto in the median view and in the best, of the trainings in README.md's picture."""
-    gains = view_gains([alone("another host: gsplat's kernels")], [alone("another host: splatfacto")])
+    gains = view_gains(*([records("trials")[f"another host: {of}/bonsai-42"]] for of in ("gsplat's kernels", HOST)))
     return f"{signed(median(gains))} and {signed(max(gains))} dB"
 
 
@@ -166,7 +161,7 @@ BLOCKS = {
     "captures.sparse": sparse,
     "captures.by_views": lambda: verdicts({f"{views} views": sparse_runs(scene) for scene, views in HALF.items()}),
     "captures.made": lambda: verdicts({kind: sparse_runs(scene) for kind, scene in MADE.items()}),
-    "captures.alone": lambda name: f"{alone(name)['seconds']:.0f} s",
+    "captures.alone": lambda name: f"{records('trials')[name]['seconds']:.0f} s",
     "readme.pictured": pictured,
     "captures.run": lambda name: _run(records("trials")[name]),
 }
