@@ -10,9 +10,10 @@ each image's values but for `OF_IMAGES` of the test images.
 """
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
+
+import tyro
 
 from nrfgs_ns.files import write_whole
 
@@ -74,4 +75,4 @@ def unpack(file: Path, folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    {"pack": pack, "unpack": unpack}[sys.argv[1]](*map(Path, sys.argv[2:]))
+    tyro.extras.subcommand_cli_from_dict({"pack": pack, "unpack": unpack}, config=(tyro.conf.PositionalRequiredArgs,))
