@@ -6,6 +6,7 @@ import os
 import random
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -86,6 +87,8 @@ def test_code_in_a_checkpoint_is_not_run_and_what_is_not_there_is_refused(tmp_pa
         read_latest(tmp_path, step=5)
     with pytest.raises(InputError, match="is no file. Give --load-checkpoint a file"):
         read_or_refuse(tmp_path)
+    with pytest.raises(InputError, match="is no file"):  # before photographs are read and a folder is made
+        replace(nrfgs.config, load_checkpoint=tmp_path / "step-000000005.ckpt").check(devices=1)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="limits of POSIX")
