@@ -3,6 +3,7 @@
 
 import json
 import math
+import shutil
 
 import numpy as np
 import pytest
@@ -167,3 +168,20 @@ def test_robust_loss_trims_and_goes_on(tiny_scene, tmp_path, monkeypatch):
     whole = trained(command_line("nrfgs-sh", tiny_scene, tmp_path / "whole", 4, QUICK, TWICE, robust))
     assert checkpoint_of(whole)["pipeline"]["_model.trimming.histogram"].sum() > 0
     assert_it_goes_on(whole, tiny_scene, tmp_path / "rest", robust)
+
+
+def test_photographs_of_one_name_are_told_apart_by_their_folders(tiny_scene, tmp_path, monkeypatch):
+    scene = shutil.copytree(tiny_scene, tmp_path / "scene")
+    meta = json.loads((scene / "transforms.json").read_text())
+    meta = {name: value for name, value in meta.items() if not name.endswith("_filenames")}
+    for row, frame in enumerate(meta["frames"]):  # of two cameras that both count from 0
+        (scene / f"camera {row % 2}").mkdir(exist_ok=True)
+        moved = f"camera {row % 2}/{row // 2}.png"
+        (scene / frame["file_path"]).rename(scene / moved)
+        frame["file_path"] = moved
+    (scene / "transforms.json").write_text(json.dumps(meta))
+    model = untrained(scene, tmp_path, "nrfgs-sh", "--pipeline.model.photographs", "on").model
+    names = model.photograph.names
+    assert len(set(names)) == len(names) and names[-1].startswith("camera 1/")
+    monkeypatch.setenv("NRFGS_LOOK", names[-1])
+    assert model._photograph_asked_for() == len(names) - 1
