@@ -63,14 +63,14 @@ def finished(tiny_scene, tmp_path_factory, any_share) -> Path:
 @pytest.mark.parametrize(("number", "step", "status"), [(signal.SIGTERM, 5, 143), (signal.SIGINT, 9, 130)])
 def test_a_training_goes_on_to_the_bit_after_a_signal(number, step, status, finished, tiny_scene, tmp_path, capsys):
     """In a step after which test images are evaluated, and in one within the window of the mean."""
-    trainer = ready(tiny_scene, tmp_path / "a")
+    trainer = ready(tiny_scene, tmp_path / "a b")
     at_step(trainer, step, lambda: os.kill(os.getpid(), number))
     capsys.readouterr()
     with pytest.raises(SystemExit) as ended:
         trainer.train()
     assert ended.value.code == status
     folder = trainer.checkpoint_dir
-    assert capsys.readouterr().out.endswith(f"Go on with the same command and --load-dir {folder}\n")
+    assert capsys.readouterr().out.endswith(f"Go on with the same command and --load-dir '{folder}'\n")
     assert list(find(folder)) == [step]
     mean = read_latest(folder)[1]["training"].get("parameter_mean")
     assert mean["count"] == 2 if step == 9 else mean is None  # of steps 8 and 9
