@@ -96,15 +96,8 @@ def read(path: Path) -> dict[str, Any]:
     return content
 
 
-def check_file(path: Path) -> None:
-    """Raise InputError where there is no such checkpoint."""
-    if not path.is_file():
-        raise InputError(f"{path} is no file. Give --load-checkpoint a file, and --load-dir a folder.")
-
-
 def read_or_refuse(path: Path) -> dict[str, Any]:
-    """As `read`, with an InputError where there is no such file or it is damaged."""
-    check_file(path)
+    """As `read`, with an InputError where the file is damaged."""
     try:
         return read(path)
     except Damaged as damage:

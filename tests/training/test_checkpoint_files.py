@@ -6,7 +6,6 @@ import os
 import random
 import signal
 import sys
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,7 +15,7 @@ from short_trainings import config_with
 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.method_config import nrfgs
-from nrfgs_ns.training.checkpoint_files import Damaged, DiskFull, find, read, read_latest, read_or_refuse, write
+from nrfgs_ns.training.checkpoint_files import Damaged, DiskFull, find, read, read_latest, write
 from nrfgs_ns.training.identity import check_data_set, check_options, data_set_of, options_of
 
 
@@ -85,10 +84,6 @@ def test_code_in_a_checkpoint_is_not_run_and_what_is_not_there_is_refused(tmp_pa
     write(tmp_path, 1, content(1))
     with pytest.raises(InputError, match="no checkpoint of step 5, only of 1"):
         read_latest(tmp_path, step=5)
-    with pytest.raises(InputError, match="is no file. Give --load-checkpoint a file"):
-        read_or_refuse(tmp_path)
-    with pytest.raises(InputError, match="is no file"):  # before photographs are read and a folder is made
-        replace(nrfgs.config, load_checkpoint=tmp_path / "step-000000005.ckpt").check(devices=1)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="limits of POSIX")
