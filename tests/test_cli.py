@@ -41,10 +41,8 @@ def test_the_list_has_every_command_and_its_first_sentence(tmp_path):
 
 
 @pytest.mark.parametrize("words, says", [
-    (["exprot"], "no command 'exprot'. Did you mean `nrfgs export`?"),
-    (["xyz"], "There are bench, demo, doctor, eval"),
-    (["eval"], "no folder outputs here"),
-    (["view", "."], "no config.yml in this folder or below"),
+    (["exprot"], "no command 'exprot'. Did you mean `nrfgs export`?"), (["eval"], "no folder outputs here"),
+    (["xyz"], "There are bench, demo, doctor, eval"), (["view", "."], "no config.yml in this folder or below"),
     (["prepare", "nowhere", "out"], "no such folder or video"),
     (["export", "ply", "--load-config", "nowhere", "--output", "x.ply"], "nowhere: no such file or folder"),
     (["export", "web", "nowhere", "--output", "x.html"], "nowhere: no such file or folder"),

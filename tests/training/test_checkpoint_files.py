@@ -172,14 +172,10 @@ def test_another_scene_is_refused(here, going_on, afterwards):
 
 
 @pytest.mark.parametrize("name, value, may_change", [
-    ("pipeline.model.appearance.num_bands", 2, False),
-    ("pipeline.model.rasterize_mode", "antialiased", False),
-    ("pipeline.datamanager.dataparser.scale_factor", 2.0, False),
-    ("pipeline.datamanager.camera_res_scale_factor", 0.5, False),
-    ("optimizers.means.optimizer.lr", 1e-5, True),
-    ("max_num_iterations", 600, True),
-    ("pipeline.model.densification.refine_every", 50, True),
-    ("pipeline.datamanager.cache_images", "cpu", True),
+    ("pipeline.model.appearance.num_bands", 2, False), ("pipeline.model.rasterize_mode", "antialiased", False),
+    ("pipeline.datamanager.dataparser.scale_factor", 2.0, False), ("max_num_iterations", 600, True),
+    ("pipeline.datamanager.camera_res_scale_factor", 0.5, False), ("optimizers.means.optimizer.lr", 1e-5, True),
+    ("pipeline.model.densification.refine_every", 50, True), ("pipeline.datamanager.cache_images", "cpu", True),
     ("pipeline.model.appearance.implementation", "torch", True),
     ("pipeline.datamanager.dataparser.data", "elsewhere", True),
 ])  # fmt: skip
