@@ -41,10 +41,8 @@ def test_the_list_has_every_command_and_its_first_sentence(tmp_path):
 
 
 @pytest.mark.parametrize("words, says", [
-    (["exprot"], "no command 'exprot'. Did you mean `nrfgs export`?"),
-    (["xyz"], "There are bench, demo, doctor, eval"),
-    (["eval"], "no folder outputs here"),
-    (["view", "."], "no config.yml in this folder or below"),
+    (["exprot"], "no command 'exprot'. Did you mean `nrfgs export`?"), (["eval"], "no folder outputs here"),
+    (["xyz"], "There are bench, demo, doctor, eval"), (["view", "."], "no config.yml in this folder or below"),
     (["prepare", "nowhere", "out"], "no such folder or video"),
     (["export", "ply", "--load-config", "nowhere", "--output", "x.ply"], "nowhere: no such file or folder"),
     (["export", "web", "nowhere", "--output", "x.html"], "nowhere: no such file or folder"),
@@ -68,6 +66,11 @@ def test_a_training_is_named_in_any_form(tmp_path, monkeypatch, capsys):
     assert f"Training: {newest.relative_to(tmp_path)}" in capsys.readouterr().out
     write_whole(runs[1] / "nerfstudio_models" / "step-000000009.ckpt", "")
     assert config_of(None).resolve() == older, "a training that failed has no checkpoint"
+    compact = tmp_path / "outputs" / "scene.nrf.nerfstudio" / "nrfgs" / "compact" / "config.yml"
+    for file in (compact, compact.parent / "nerfstudio_models" / "step-000000009.ckpt"):
+        write_whole(file, "")
+    assert config_of(None).resolve() == older, "a compact file is no training"
+    assert config_of(compact.parents[2]).resolve() == compact
     assert NamesTraining(load_config=older).config() == NamesTraining(older).config() == older
     with pytest.raises(InputError, match="Give one"):
         NamesTraining(older, load_config=older).config()

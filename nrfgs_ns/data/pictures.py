@@ -71,6 +71,15 @@ def naming(path: Path, finding: str) -> Iterator[None]:
         ) from error
 
 
+def picture_names(paths: Sequence[Path]) -> list[str]:
+    """Names of pictures that tell them apart: the files', or where two are alike, as of several cameras with a folder
+    each, the paths below their common folder."""
+    names = [path.name for path in paths]
+    if len(set(names)) == len(names):
+        return names
+    return [path.relative_to(os.path.commonpath(paths)).as_posix() for path in paths]
+
+
 def read_size(path: Path) -> tuple[int, int]:
     """Width and height of an image, by its header."""
     with open_picture(path) as image:

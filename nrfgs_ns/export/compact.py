@@ -4,6 +4,7 @@
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from shlex import quote
 from time import perf_counter
 from typing import Any
 
@@ -52,7 +53,8 @@ def export_compact(
         f"{ply_size / size:.1f} times as much."
     ]
     lines += [lost(numbers)] if measure else []
-    lines += [f"Look at it with:  nrfgs view {output}", f"Evaluate it with:  ns-eval --load-config {config}"]
+    file, saved = quote(str(output)), quote(str(config))
+    lines += [f"Look at it with:  nrfgs view {file}", f"Evaluate it with:  ns-eval --load-config {saved}"]
     finish(lines, numbers, report)
 
 

@@ -41,6 +41,8 @@ def config_of(path: Path | None) -> Path:
     if not configs:
         raise InputError(f"{folder}: no config.yml in this folder or below. Name the folder of a training.")
     trained = [config for config in configs if any(config.parent.glob("*/step-*.ckpt"))]
-    newest = max(trained or configs, key=lambda config: config.stat().st_mtime)
+    # One of a compact file (`export.compact.write_config`) is newer than that of the training that it was made from.
+    own = [config for config in trained if not config.match("*.nerfstudio/*/compact/config.yml")]
+    newest = max(own or trained or configs, key=lambda config: config.stat().st_mtime)
     print(f"Training: {newest}", flush=True)
     return newest

@@ -120,11 +120,12 @@ def measure_loss(pipeline, pictures: Callable[[Any], dict[str, Tensor]]) -> dict
     Returns:
         means over the images, dB, inside their masks: psnr_model, psnr_NAME; loss_db: model minus file; and per_image.
     """
+    from nrfgs_ns.data.pictures import picture_names
     from nrfgs_ns.image.metrics import psnr
     from nrfgs_ns.progress import progress
 
     model, data = pipeline.model, pipeline.datamanager
-    names = [Path(name).name for name in data.eval_dataset.image_filenames]
+    names = picture_names(data.eval_dataset.image_filenames)
     per_image, scores = [], {}
     with progress("Measuring the loss", len(names)) as advance:
         for image, (camera, batch) in zip(names, data.fixed_indices_eval_dataloader, strict=True):

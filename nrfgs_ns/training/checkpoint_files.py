@@ -97,9 +97,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def read_or_refuse(path: Path) -> dict[str, Any]:
-    """As `read`, with an InputError where there is no such file or it is damaged."""
-    if not path.is_file():
-        raise InputError(f"{path} is no file. Give --load-checkpoint a file, and --load-dir a folder.")
+    """As `read`, with an InputError where the file is damaged."""
     try:
         return read(path)
     except Damaged as damage:

@@ -118,7 +118,9 @@ class TimedPace(Pace):
 
     @property
     def steps_left(self) -> int:
-        """Estimated number of steps to come."""
+        """Estimated number of steps to come; beyond the schedules' end, as with a larger budget, by the clock."""
+        if self.position >= self.length and self.step_seconds > 0:
+            return math.ceil(max(self.seconds - self.elapsed, 0.0) / self.step_seconds - 0.5)
         return math.ceil((self.length - self.position) / self.rate)
 
     def start(self) -> None:

@@ -15,7 +15,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from nrfgs_ns.data.pictures import read_exif
+from nrfgs_ns.data.pictures import picture_names, read_exif
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image import overlap
 from nrfgs_ns.image.overlap import ENOUGH_STOPS, Looks, Pairs, estimate, slope, spread, varies
@@ -66,8 +66,7 @@ def photograph_model(config: Any, datamanager: Any) -> PhotographModel | None:
     if not wanted:
         return None
     looks = estimate(pairs, exif, centers) if torch.isfinite(exif).any() else seen
-    names = [path.name for path in dataset.image_filenames]
-    return PhotographModel(names, looks.stops, looks.held)
+    return PhotographModel(picture_names(dataset.image_filenames), looks.stops, looks.held)
 
 
 def check_same_photographs(own: PhotographModel | None, written: Mapping[str, Any] | None) -> None:

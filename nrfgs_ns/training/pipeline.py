@@ -24,6 +24,7 @@ from nrfgs_ns.appearance.head import AppearanceHead
 from nrfgs_ns.compact.decode import decode, model_state
 from nrfgs_ns.data.checks import some, warn
 from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
+from nrfgs_ns.data.pictures import picture_names
 from nrfgs_ns.densification import statistics
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image import ssim
@@ -168,7 +169,7 @@ class NrfgsPipeline(VanillaPipeline):
         self.eval()
         if output_path is not None:
             output_path.mkdir(exist_ok=True, parents=True)
-        names = [Path(name).name for name in self.datamanager.eval_dataset.image_filenames]
+        names = picture_names(self.datamanager.eval_dataset.image_filenames)
         pairs = list(zip(names, self.datamanager.fixed_indices_eval_dataloader, strict=True))
         per_image: list[dict[str, Any]] = []
         for index, (name, (camera, batch)) in enumerate(track(pairs, "Evaluating", console=CONSOLE, transient=True)):

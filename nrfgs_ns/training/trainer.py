@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import reduce
+from shlex import quote
 from typing import Any, Literal
 
 import torch
@@ -292,7 +293,7 @@ class NrfgsTrainer(Trainer):
         """Save the last completed step unless it has been; returns how to go on."""
         if self._saved_step != self._made:
             self.save_checkpoint(self._made)
-        return f"Go on with the same command and --load-dir {self.checkpoint_dir}"
+        return f"Go on with the same command and --load-dir {quote(str(self.checkpoint_dir))}"
 
     def _end(self, line: str, status: int) -> None:
         if comms.is_main_process():

@@ -105,6 +105,8 @@ class NrfgsTrainerConfig(TrainerConfig):
             raise InputError(f"load_step is {self.load_step}, but there is no --load-dir. Give the folder, too.")
         if self.load_dir is not None:
             checkpoint_files.checkpoints_in(self.load_dir)
+        elif (file := self.load_checkpoint) is not None and not file.is_file():
+            raise InputError(f"load_checkpoint is {file}, which is no file. Give a checkpoint, or --load-dir a folder.")
 
     def for_views(self, views: int) -> "NrfgsTrainerConfig":
         """The configuration of a training on one device, with automatic steps, schedules and mean filled in."""

@@ -172,11 +172,8 @@ def test_nerfstudio_finds_the_plugin_where_it_is_imported_first():
 
 
 @pytest.mark.parametrize("name, train, test, points, masks", [
-    ("bonsai", 255, 37, 72486, False),
-    ("goldcape", 74, 11, 21640, True),
-    ("kitchen", 21, 3, 2630, False),
-    ("fox", 43, 7, 11030, False),
-    ("fern", 17, 3, 6407, False),
+    ("bonsai", 255, 37, 72486, False), ("goldcape", 74, 11, 21640, True), ("kitchen", 21, 3, 2630, False),
+    ("fox", 43, 7, 11030, False), ("fern", 17, 3, 6407, False),
 ])  # fmt: skip
 def test_real_captures(captures, name, train, test, points, masks):
     parser = NrfgsDataParserConfig(data=captures / name).setup()

@@ -110,8 +110,7 @@ def test_original_keeps_its_calendar():
 
 # The option on the command line.
 @pytest.mark.parametrize("text, config", [
-    ("splatfacto", Splatfacto()),
-    ("original", Original()),
+    ("splatfacto", Splatfacto()), ("original", Original()),
     ("mcmc,budget=77,opacity-seen=base", Mcmc(budget=77, opacity_seen="base")),
     ("splatfacto,refine_every=50,densify_grad_thresh=4e-4", Splatfacto(refine_every=50, densify_grad_thresh=4e-4)),
 ])  # fmt: skip

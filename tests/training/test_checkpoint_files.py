@@ -15,7 +15,7 @@ from short_trainings import config_with
 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.method_config import nrfgs
-from nrfgs_ns.training.checkpoint_files import Damaged, DiskFull, find, read, read_latest, read_or_refuse, write
+from nrfgs_ns.training.checkpoint_files import Damaged, DiskFull, find, read, read_latest, write
 from nrfgs_ns.training.identity import check_data_set, check_options, data_set_of, options_of
 
 
@@ -84,8 +84,6 @@ def test_code_in_a_checkpoint_is_not_run_and_what_is_not_there_is_refused(tmp_pa
     write(tmp_path, 1, content(1))
     with pytest.raises(InputError, match="no checkpoint of step 5, only of 1"):
         read_latest(tmp_path, step=5)
-    with pytest.raises(InputError, match="is no file. Give --load-checkpoint a file"):
-        read_or_refuse(tmp_path)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="limits of POSIX")
@@ -174,14 +172,10 @@ def test_another_scene_is_refused(here, going_on, afterwards):
 
 
 @pytest.mark.parametrize("name, value, may_change", [
-    ("pipeline.model.appearance.num_bands", 2, False),
-    ("pipeline.model.rasterize_mode", "antialiased", False),
-    ("pipeline.datamanager.dataparser.scale_factor", 2.0, False),
-    ("pipeline.datamanager.camera_res_scale_factor", 0.5, False),
-    ("optimizers.means.optimizer.lr", 1e-5, True),
-    ("max_num_iterations", 600, True),
-    ("pipeline.model.densification.refine_every", 50, True),
-    ("pipeline.datamanager.cache_images", "cpu", True),
+    ("pipeline.model.appearance.num_bands", 2, False), ("pipeline.model.rasterize_mode", "antialiased", False),
+    ("pipeline.datamanager.dataparser.scale_factor", 2.0, False), ("max_num_iterations", 600, True),
+    ("pipeline.datamanager.camera_res_scale_factor", 0.5, False), ("optimizers.means.optimizer.lr", 1e-5, True),
+    ("pipeline.model.densification.refine_every", 50, True), ("pipeline.datamanager.cache_images", "cpu", True),
     ("pipeline.model.appearance.implementation", "torch", True),
     ("pipeline.datamanager.dataparser.data", "elsewhere", True),
 ])  # fmt: skip

@@ -63,14 +63,14 @@ def finished(tiny_scene, tmp_path_factory, any_share) -> Path:
 @pytest.mark.parametrize(("number", "step", "status"), [(signal.SIGTERM, 5, 143), (signal.SIGINT, 9, 130)])
 def test_a_training_goes_on_to_the_bit_after_a_signal(number, step, status, finished, tiny_scene, tmp_path, capsys):
     """In a step after which test images are evaluated, and in one within the window of the mean."""
-    trainer = ready(tiny_scene, tmp_path / "a")
+    trainer = ready(tiny_scene, tmp_path / "a b")
     at_step(trainer, step, lambda: os.kill(os.getpid(), number))
     capsys.readouterr()
     with pytest.raises(SystemExit) as ended:
         trainer.train()
     assert ended.value.code == status
     folder = trainer.checkpoint_dir
-    assert capsys.readouterr().out.endswith(f"Go on with the same command and --load-dir {folder}\n")
+    assert capsys.readouterr().out.endswith(f"Go on with the same command and --load-dir '{folder}'\n")
     assert list(find(folder)) == [step]
     mean = read_latest(folder)[1]["training"].get("parameter_mean")
     assert mean["count"] == 2 if step == 9 else mean is None  # of steps 8 and 9
@@ -175,26 +175,14 @@ def test_a_finished_training_says_so_and_how_to_extend_it(finished, tiny_scene, 
 
 
 @pytest.mark.parametrize(("option", "bad"), [
-    ("max_num_iterations", -1),
-    ("pipeline.model.view_noise", math.inf),
-    ("pipeline.model.ssim_lambda", math.nan),
-    ("pipeline.model.resolution_schedule", 0),
-    ("pipeline.model.robust_loss", 2.0),
-    ("pipeline.datamanager.camera_res_scale_factor", 0),
-    ("pipeline.datamanager.train_cameras_sampling_strategy", "fps"),
-    ("logging.steps_per_log", 0),
-    ("load_step", 5),
-    ("time_budget", 0),
-    ("time_budget", math.nan),
-    ("schedule_steps", -5),
-    ("machine.num_devices", 0),
-    ("machine.device_type", "cuda"),
-    ("optimizers.quats.optimizer.lr", -1.0),
-    ("optimizers.means.optimizer.lr", 0.0),
-    ("optimizers.quats.optimizer.lr", 1e30),
-    ("optimizers.means.scheduler.lr_final", 0.0),
-    ("mixed_precision", True),
-    ("gradient_accumulation_steps", {"means": 2}),
+    ("max_num_iterations", -1), ("pipeline.model.view_noise", math.inf), ("pipeline.model.ssim_lambda", math.nan),
+    ("pipeline.model.resolution_schedule", 0), ("pipeline.model.robust_loss", 2.0), ("load_step", 5),
+    ("pipeline.datamanager.camera_res_scale_factor", 0), ("logging.steps_per_log", 0),
+    ("pipeline.datamanager.train_cameras_sampling_strategy", "fps"), ("schedule_steps", -5),
+    ("load_checkpoint", Path("gone.ckpt")), ("load_checkpoint", Path()), ("time_budget", 0), ("time_budget", math.nan),
+    ("machine.num_devices", 0), ("machine.device_type", "cuda"), ("optimizers.quats.optimizer.lr", -1.0),
+    ("optimizers.means.optimizer.lr", 0.0), ("optimizers.quats.optimizer.lr", 1e30), ("mixed_precision", True),
+    ("optimizers.means.scheduler.lr_final", 0.0), ("gradient_accumulation_steps", {"means": 2}),
 ])  # fmt: skip
 def test_options_without_sense_are_refused(option, bad, tiny_scene):
     config = replace(config_with(option, bad), data=tiny_scene)

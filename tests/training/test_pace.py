@@ -74,6 +74,20 @@ def test_what_steps_cost_decides_how_evenly_they_are_spread():
     assert resolution_phases(2, 3000) == [(3000.0, 0.25), (6000.0, 0.5), (math.inf, 1.0)]
 
 
+def test_beyond_the_schedules_the_clock_says_how_many_steps_are_left():
+    """Of a training that goes on with a larger budget after its end, whose mean would be of all further steps."""
+    now, left = 0.0, []
+    pace = TimedPace(LENGTH, 20.0, clock=lambda: now)
+    pace.load_state({"length": LENGTH, "rate": 100.0, "position": float(LENGTH), "seconds": 10.0})
+    pace.start()
+    while not pace.is_spent:
+        pace.begin_step()
+        now += 0.1
+        pace.advance()
+        left.append(pace.steps_left)
+    assert left[1:] == [*range(98, -1, -1)]
+
+
 def test_steps_of_positions():
     pace = Pace(LENGTH, rate=30.0)
     assert pace.step_at(0, 0) == 0 and pace.step_at(1, 0) == 1 and pace.step_at(500, 0) == 17  # 17 * 30 = 510

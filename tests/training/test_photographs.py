@@ -3,6 +3,7 @@
 
 import json
 import math
+import shutil
 
 import numpy as np
 import pytest
@@ -32,15 +33,11 @@ CENTERS = torch.arange(11.0)[:, None] * torch.tensor([1.0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize(("pairs", "known", "wanted"), [
-    (SAME, [NAN] * 11, False),
-    (DIFFERENT, [NAN] * 11, True),
-    (pairs_with([0.5, -0.5, 0.5]), [NAN] * 11, False),
-    (pairs_with([]), [0.0, 1.5] + [NAN] * 9, True),
-    (SAME, [0.3] + [NAN] * 10, False),
-    (SAME, [0.3, 0.5] * 5 + [0.3], False),
+    (SAME, [NAN] * 11, False), (DIFFERENT, [NAN] * 11, True),
+    (pairs_with([0.5, -0.5, 0.5]), [NAN] * 11, False), (pairs_with([]), [0.0, 1.5] + [NAN] * 9, True),
+    (SAME, [0.3] + [NAN] * 10, False), (SAME, [0.3, 0.5] * 5 + [0.3], False),
     # The light changed, and the camera followed it.
-    (SAME, [0.0, 0.9] * 5 + [0.0], False),
-    (DIFFERENT, [0.0, 0.7] * 5 + [0.0], True),
+    (SAME, [0.0, 0.9] * 5 + [0.0], False), (DIFFERENT, [0.0, 0.7] * 5 + [0.0], True),
 ])  # fmt: skip
 def test_the_evidence_decides(pairs, known, wanted):
     assert they_differ(pairs, torch.tensor(known), estimate(pairs, torch.full((11,), NAN), CENTERS)) == wanted
@@ -167,3 +164,15 @@ def test_robust_loss_trims_and_goes_on(tiny_scene, tmp_path, monkeypatch):
     whole = trained(command_line("nrfgs-sh", tiny_scene, tmp_path / "whole", 4, QUICK, TWICE, robust))
     assert checkpoint_of(whole)["pipeline"]["_model.trimming.histogram"].sum() > 0
     assert_it_goes_on(whole, tiny_scene, tmp_path / "rest", robust)
+
+
+def test_photographs_of_one_name_are_told_apart_by_their_folders(tiny_scene, tmp_path):
+    scene = shutil.copytree(tiny_scene, tmp_path / "scene")
+    listed = (scene / "transforms.json").read_text()
+    for folder, name in (("left", "images/view_001.png"), ("right", "images/view_002.png")):
+        (scene / folder).mkdir()
+        (scene / name).rename(scene / folder / "1.png")
+        listed = listed.replace(name, f"{folder}/1.png")
+    (scene / "transforms.json").write_text(listed)
+    model = untrained(scene, tmp_path, "nrfgs-sh", "--pipeline.model.photographs", "on").model
+    assert {"left/1.png", "right/1.png", "images/view_003.png"} < set(model.photograph.names)

@@ -15,6 +15,7 @@ from PIL import Image
 
 from nrfgs_ns.appearance.nrf import NeuralResidualField
 from nrfgs_ns.appearance.reduce import branches
+from nrfgs_ns.data.pictures import picture_names
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.compact import load_field, write_file
@@ -46,7 +47,7 @@ def export_web(
     alone = output.suffix.lower() in (".html", ".htm")
     with few_threads() as threads:
         pipeline = load_field(load_config, measure)
-        names = [Path(name).name for name in pipeline.datamanager.train_dataset.image_filenames]
+        names = picture_names(pipeline.datamanager.train_dataset.image_filenames)
         guide = {"tour": read_tour(web.tour, names), "notes": read_notes(web.notes), "rotate": web.rotate}
         threads.suit_to(pipeline)
         if (vectors := weight_vectors(pipeline.model.head)) > MOST_WEIGHTS:
@@ -118,13 +119,13 @@ def surroundings(pipeline) -> tuple[dict[str, Any], bytes]:
     typical = known[len(known) // 2] if known else model.scene_unit
     photographs = [
         {
-            "name": Path(name).name,
+            "name": name,
             "pose": _rounded(poses[i].flatten()),
             "lens": _rounded(torch.stack([getattr(cameras, part)[i, 0] for part in ("fx", "fy", "cx", "cy")])),
             "size": [int(cameras.width[i]), int(cameras.height[i])],
             "distance": distances[i] or typical,
         }
-        for i, name in enumerate(data.train_dataset.image_filenames)
+        for i, name in enumerate(picture_names(data.train_dataset.image_filenames))
     ]
     return {"photographs": photographs, "start": start, "up": _rounded(up)}, _jpeg(poster)
 
