@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from time import monotonic
 
 from nerfstudio.utils.rich_utils import CONSOLE
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 SECONDS_BETWEEN_LINES = 30.0
@@ -14,16 +13,16 @@ SECONDS_BETWEEN_LINES = 30.0
 
 
 @contextlib.contextmanager
-def progress(description: str, total: int | None = None, console: Console = CONSOLE) -> Iterator[Callable[..., None]]:
+def progress(description: str, total: int | None = None) -> Iterator[Callable[..., None]]:
     """Show the progress of `total` pieces of work; yields advance(description=None), to be called after each."""
-    if console.is_terminal:
+    if CONSOLE.is_terminal:
         columns = TextColumn("{task.description:<40}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-        with Progress(*columns, console=console, transient=True) as bar:
+        with Progress(*columns, console=CONSOLE, transient=True) as bar:
             task = bar.add_task(description, total=total)
             yield lambda description=None: bar.update(task, advance=1, description=description)
         return
     done, printed = 0, monotonic()
-    console.print(f"{description} ...", markup=False, highlight=False, soft_wrap=True)
+    CONSOLE.print(f"{description} ...", markup=False, highlight=False, soft_wrap=True)
 
     def advance(detail: str | None = None) -> None:
         nonlocal done, printed
@@ -31,6 +30,6 @@ def progress(description: str, total: int | None = None, console: Console = CONS
         if monotonic() - printed >= SECONDS_BETWEEN_LINES:
             printed = monotonic()
             count = f"{done:,}" if total is None else f"{done:,} of {total:,}"
-            console.print(f"{detail or description}: {count}", markup=False, highlight=False, soft_wrap=True)
+            CONSOLE.print(f"{detail or description}: {count}", markup=False, highlight=False, soft_wrap=True)
 
     yield advance

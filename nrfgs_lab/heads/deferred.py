@@ -65,7 +65,6 @@ class Deferred(FeatureHead):
 
     def __init__(self, config: DeferredConfig):
         super().__init__()
-        self.config = config
         self.stored = config.channels // 2 if config.harmonics else config.channels
         widths = [config.channels + num_bases(RAY_DEGREE), *[config.hidden_width] * config.hidden_layers]
         layers = [layer for sizes in pairwise(widths) for layer in (nn.Linear(*sizes), nn.ReLU())]

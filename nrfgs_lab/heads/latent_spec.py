@@ -62,7 +62,6 @@ class LatentSpec(FeatureHead):
 
     def __init__(self, config: LatentSpecConfig):
         super().__init__()
-        self.config = config
         self.stored = config.diffuse_dim + config.specular_dim
         width, of_specular = config.hidden_width, config.specular_dim + DIRECTION_DIM
         self.mask = nn.Sequential(nn.Linear(of_specular, width), nn.ELU(), nn.Linear(width, 1), nn.Sigmoid())

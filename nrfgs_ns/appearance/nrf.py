@@ -134,7 +134,6 @@ class NeuralResidualField(AppearanceHead):
 
     def __init__(self, config: NrfConfig):
         super().__init__()
-        self.config = config
         shared = config.latent_dim + 3 + int(config.use_distance)  # z, c, log r
         low, high = 1 + 3 + BAND_DIM, BAND_DIM * (config.num_bands - 1)  # alpha, d and band 0; the other bands
         outputs = 3 + int(config.opacity_residual)  # dc, d_alpha

@@ -55,12 +55,8 @@ class SphericalGaussians(AppearanceHead):
     """Colours from base and lobes, opacities from the base."""
 
     name = "sg"
-
-    def __init__(self, config: SgConfig):
-        super().__init__()
-        self.config = config
-        self.active = True
-        """whether there are lobes yet."""
+    active: bool = True
+    """whether there are lobes yet."""
 
     def splat_params(self, rgb: Tensor) -> dict[str, Tensor]:
         """Base colours "features_dc" [N, 3]; axes "sg_axes" [N, L, 3], of any length but zero; "sg_sharpness" [N, L],

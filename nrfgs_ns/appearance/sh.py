@@ -50,9 +50,7 @@ class SphericalHarmonics(AppearanceHead):
 
     def __init__(self, config: ShConfig):
         super().__init__()
-        self.config = config
-        self.sh_degree = config.degree
-        self.active_degree = config.degree
+        self.sh_degree = self.active_degree = config.degree
 
     def splat_params(self, rgb: Tensor) -> dict[str, Tensor]:
         """Coefficients: "features_dc" [N, 3], and the higher degrees' "features_rest" [N, (degree + 1)^2 - 1, 3]."""

@@ -75,7 +75,7 @@ class ShardedModel(NrfgsModel):
     @property
     def parameter_bytes(self) -> int:
         row = sum(value.shape[1:].numel() * value.element_size() for value in self.gauss_params.values())
-        return row * self.num_splats + sum(weight.numel() * weight.element_size() for weight in self.head.parameters())
+        return row * self.num_splats + sum(weight.nbytes for weight in self.head.parameters())
 
     # Rendering.
 
@@ -136,7 +136,6 @@ class ShardedModel(NrfgsModel):
         return losses
 
     def step_post_backward(self, step: int) -> None:
-        assert step == self.step
         self.densification.post_backward(step, self._screen_info(), self.gauss_params, self.optimizers)
         if step % self.config.densification.refine_every == 0:
             self.count()

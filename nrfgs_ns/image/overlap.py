@@ -167,11 +167,6 @@ def spread(known: Tensor) -> float:
     return float(there.std(correction=0)) if len(there) else 0.0
 
 
-def varies(known: Tensor) -> bool:
-    """Whether known exposures (stops, NaN where unknown, [V]) differ enough to be learnt."""
-    return spread(known) >= ENOUGH_KNOWN_STOPS
-
-
 def slope(pairs: Pairs, known: Tensor) -> float:
     """Stops of brightness for a stop of known exposure (stops, NaN where unknown, [V]), by regression over the pairs, 0
     to 1; 1 if there are too few of them."""

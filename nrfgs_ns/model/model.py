@@ -352,7 +352,6 @@ class NrfgsModel(ExportedModel):
         return self._downscale_if_required(batch["mask"]).to(self.device) >= 0.5
 
     def step_post_backward(self, step: int) -> None:
-        assert step == self.step
         self.densification.post_backward(step, self.info, self.gauss_params, self.optimizers)
 
     # Metrics.

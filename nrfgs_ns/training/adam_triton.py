@@ -8,6 +8,7 @@ the device in each step, because the gradients' addresses change.
 The equations are torch's (Kingma and Ba 2015), in float32; the bias corrections in float64.
 """
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -180,3 +181,6 @@ class AdamTable:
         self.rows[FIXED, :count] = (each[:4] - each[0, 0]) >> 2
         self.fixed, self.programs = fixed, int(programs.sum())
         return True
+
+
+table_on = functools.cache(AdamTable)

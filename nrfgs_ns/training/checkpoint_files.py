@@ -35,10 +35,9 @@ class Damaged(ValueError):
 def allow_nerfstudio_checkpoints() -> None:
     """Let `torch.load(weights_only=True)` read the numpy scalars in the state of nerfstudio's learning-rate schedulers.
     These types are plain data."""
-    scalar = np._core.multiarray.scalar if hasattr(np, "_core") else np.core.multiarray.scalar
-    torch.serialization.add_safe_globals(
-        [scalar, (scalar, "numpy.core.multiarray.scalar"), np.dtype, np.dtypes.Float64DType]
-    )
+    scalar = np._core.multiarray.scalar
+    older = scalar, "numpy.core.multiarray.scalar"
+    torch.serialization.add_safe_globals([scalar, older, np.dtype, np.dtypes.Float64DType])
 
 
 def find(folder: Path) -> dict[int, Path]:

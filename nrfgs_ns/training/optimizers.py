@@ -123,9 +123,6 @@ class LeanOptimizers(Optimizers):
                 group["lr"] = rate
 
 
-_TABLES: dict[torch.device, Any] = {}
-
-
 def step_at_once(optimizers: Sequence[Adam]) -> bool:
     """Make one step of several fused Adams that have state, in one Triton kernel, if it can; as in torch, the step is
     skipped where `found_inf` (a tensor on the device) is 1. Returns whether the step was made."""
@@ -139,14 +136,12 @@ def step_at_once(optimizers: Sequence[Adam]) -> bool:
     skips = [getattr(optimizer, "found_inf", None) for optimizer in optimizers]
     if device.type != "cuda" or any(skip is not skips[0] for skip in skips) or not try_kernel(device):
         return False
-    from nrfgs_ns.training.adam_triton import AdamTable
+    from nrfgs_ns.training.adam_triton import table_on
 
-    if device not in _TABLES:
-        _TABLES[device] = AdamTable(device)
     counters = [state["step"] for _, _, states in work for state in states]
     with torch.no_grad():
         torch._foreach_add_(counters, 1)
-        done = _TABLES[device].step(work, skips[0])
+        done = table_on(device).step(work, skips[0])
         if not done:
             torch._foreach_sub_(counters, 1)
     return done

@@ -18,7 +18,7 @@ from torch import Tensor
 from nrfgs_ns.data.pictures import picture_names, read_exif
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image import overlap
-from nrfgs_ns.image.overlap import ENOUGH_STOPS, Looks, Pairs, estimate, slope, spread, varies
+from nrfgs_ns.image.overlap import ENOUGH_KNOWN_STOPS, ENOUGH_STOPS, Looks, Pairs, estimate, slope, spread
 from nrfgs_ns.image.photograph import PhotographModel
 from nrfgs_ns.rasterizer import world_to_camera
 
@@ -36,7 +36,8 @@ def they_differ(pairs: Pairs, exif: Tensor, seen: Looks) -> bool:
         seen: exposures from the pairs alone.
     """
     vary = any(size >= enough for size, enough in zip(seen.random, ENOUGH_STOPS, strict=True))
-    return vary or varies(exif) and slope(pairs, exif) * spread(exif) >= ENOUGH_STOPS[0]
+    known = spread(exif)
+    return vary or known >= ENOUGH_KNOWN_STOPS and slope(pairs, exif) * known >= ENOUGH_STOPS[0]
 
 
 def photograph_model(config: Any, datamanager: Any) -> PhotographModel | None:

@@ -111,7 +111,7 @@ class NrfgsPipeline(VanillaPipeline):
 
     def _check_smallest_image(self) -> None:
         """Raise InputError where a training's first images are too small for SSIM."""
-        cameras, factor = self.datamanager.train_dataset.cameras, 2 ** max(self.config.model.num_downscales, 0)
+        cameras, factor = self.datamanager.train_dataset.cameras, 2**self.config.model.num_downscales
         width, height = (int(side.min()) // factor for side in (cameras.width, cameras.height))
         if min(width, height) < SMALLEST_SIDE:
             raise InputError(

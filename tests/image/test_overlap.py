@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nrfgs_ns.image import overlap
-from nrfgs_ns.image.overlap import ENOUGH_STOPS, compare, estimate, sight, slope, varies
+from nrfgs_ns.image.overlap import ENOUGH_KNOWN_STOPS, ENOUGH_STOPS, compare, estimate, sight, slope, spread
 from nrfgs_ns.image.photograph import BASIS, exposed
 
 WIDTH, HEIGHT, FOCAL = 120, 90, 110.0
@@ -130,7 +130,8 @@ def test_exif_is_a_start_as_far_as_photographs_agree_with_it():
 def test_exif_alone():
     nothing = compare([], torch.zeros(0, 3))
     known = torch.tensor([0.0, 1.0, UNKNOWN, 2.0])
-    assert varies(known) and not varies(torch.tensor([0.3, 0.4, UNKNOWN])) and not varies(torch.tensor([UNKNOWN]))
+    assert spread(known) >= ENOUGH_KNOWN_STOPS > spread(torch.tensor([0.3, 0.4, UNKNOWN]))
+    assert spread(torch.tensor([UNKNOWN])) == 0.0
     assert slope(nothing, known) == 1.0
     looks = estimate(nothing, known, torch.rand(4, 3))
     assert looks.stops[:, 0].tolist() == pytest.approx([-1.0, 0.0, 0.0, 1.0])

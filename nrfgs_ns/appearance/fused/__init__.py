@@ -68,7 +68,7 @@ class FusedField:
             self._ready_on(device)
 
     def __call__(
-        self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor, scene_unit: float = 1.0
+        self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor, scene_unit: float
     ) -> tuple[Tensor, Tensor]:
         """Colours [M, 3] and opacities [M]: see AppearanceHead.forward, after `takes` said yes."""
         from nrfgs_ns.appearance.fused.launch import FieldOptions, FusedFunction
