@@ -200,10 +200,6 @@ class Field(NamedTuple):
         """Their part that does not depend on the camera."""
         return self.head.base_appearance(self.splats, view.visible)
 
-    def components_of(self, view: Sight) -> dict[str, Component]:
-        """Parts of the head's result (`AppearanceHead.components`)."""
-        return self.head.components(self.splats, view.visible, view.center)
-
     def detached(self) -> "Field":
         """The same without gradients to the table."""
         return Field(self.head, {name: value.detach() for name, value in self.splats.items()})

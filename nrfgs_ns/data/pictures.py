@@ -75,9 +75,9 @@ def picture_names(paths: Sequence[Path]) -> list[str]:
     """Names of pictures that tell them apart: the files', or where two are alike, as of several cameras with a folder
     each, the paths below their common folder."""
     names = [path.name for path in paths]
-    if len(set(names)) == len(names):
-        return names
-    return [path.relative_to(os.path.commonpath(paths)).as_posix() for path in paths]
+    if len(set(names)) < len(names):
+        names = [path.relative_to(os.path.commonpath(paths)).as_posix() for path in paths]
+    return names
 
 
 def read_size(path: Path) -> tuple[int, int]:

@@ -20,14 +20,7 @@ from nerfstudio.utils.colors import get_color
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
-from nrfgs_ns.appearance.head import (
-    AppearanceHeadConfig,
-    Field,
-    SplatAppearance,
-    ViewNoise,
-    check_head,
-    failures_told,
-)
+from nrfgs_ns.appearance.head import AppearanceHeadConfig, Field, SplatAppearance, ViewNoise, check_head, failures_told
 from nrfgs_ns.data.checks import warn
 from nrfgs_ns.data.views import camera_spacing
 from nrfgs_ns.densification import Densification

@@ -40,9 +40,12 @@ def config_of(path: Path | None) -> Path:
     configs = [config for depth in range(4) for config in folder.glob("*/" * depth + "config.yml")]
     if not configs:
         raise InputError(f"{folder}: no config.yml in this folder or below. Name the folder of a training.")
-    trained = [config for config in configs if any(config.parent.glob("*/step-*.ckpt"))]
-    # One of a compact file (`export.compact.write_config`) is newer than that of the training that it was made from.
-    own = [config for config in trained if not config.match("*.nerfstudio/*/compact/config.yml")]
-    newest = max(own or trained or configs, key=lambda config: config.stat().st_mtime)
+
+    def order(config: Path) -> tuple[bool, bool, float]:
+        # One of a compact file (`export.compact.write_config`) is newer than that of the training it was made from.
+        is_compact = config.match("*.nerfstudio/*/compact/config.yml")
+        return any(config.parent.glob("*/step-*.ckpt")), not is_compact, config.stat().st_mtime
+
+    newest = max(configs, key=order)
     print(f"Training: {newest}", flush=True)
     return newest

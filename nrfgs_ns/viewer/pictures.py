@@ -110,7 +110,7 @@ def picture(
     elif options.mode == VIEW_DEPENDENCE:
         share = _blend(view, view_dependence(field, view) / FULL_DEVIATION, appearance.opacities, accumulation)
     else:
-        component = field.components_of(view)[options.mode]
+        component = field.head.components(field.splats, view.visible, view.center)[options.mode]
         if component.kind != "weight":
             axis = 1.0 if component.kind == "color" else component.values.new_tensor(OPACITY_AXIS)
             drawn = GREY + AMPLIFICATION * options.gain * component.values * axis

@@ -51,12 +51,7 @@ class Launches(NamedTuple):
     backward: Launch
 
 
-KINDS = {
-    "fp32": ("tf32x3", "tf32x3"),
-    "tf32": ("tf32", "tf32"),
-    "bf16": ("bf16", "bf16"),
-    "fp16": ("fp16", "bf16"),
-}
+KINDS = {"fp32": ("tf32x3", "tf32x3"), "tf32": ("tf32", "tf32"), "bf16": ("bf16", "bf16"), "fp16": ("fp16", "bf16")}
 """Kinds of products, without and with gradients among the factors, for each NrfConfig.precision.
 
 float32 is three tf32 products on the tensor cores, many times faster than float32 multiply-add. Gradients are never
