@@ -47,8 +47,8 @@ class Table:
     def __len__(self) -> int:
         return len(self.splats["means"])
 
-    def set_opacity(self, row: int, opacity: float) -> None:
-        self.splats["opacities"].data[row] = logit(opacity)
+    def set_opacity(self, rows: int | slice, opacity: float) -> None:
+        self.splats["opacities"].data[rows] = logit(opacity)
 
     def info(self, gradient: float | torch.Tensor = 0.0, absgrad: torch.Tensor | None = None) -> dict:
         """A 100 x 100 picture that shows every splat, each with this gradient along x in units of half the picture."""

@@ -124,8 +124,7 @@ def test_halves_keep_each_axis_variance_and_the_opacity(places):
 
 def test_a_share_of_the_candidates_is_split_and_the_dead_are_replaced():
     table, strategy = Table(40), rules(threshold=0.01)
-    for row in range(4):
-        table.set_opacity(row, 0.001)
+    table.set_opacity(slice(4), 0.001)
     stored = torch.sigmoid(table.splats["opacities"].detach()).flatten()
     table.step(strategy, 600, shown=stored, absgrad=(torch.arange(40) >= 20).float()[:, None].repeat(1, 2))
     table.check()
@@ -137,8 +136,7 @@ def test_a_share_of_the_candidates_is_split_and_the_dead_are_replaced():
 
 def test_the_shown_opacity_decides_what_is_dead():
     table, strategy = Table(10), rules(threshold=10.0)
-    for row in range(10):
-        table.set_opacity(row, 0.001)
+    table.set_opacity(slice(10), 0.001)
     shown = torch.full((10,), 0.3)
     shown[4:] = 0.001
     shown[9] = 0.9

@@ -125,9 +125,7 @@ def test_noise_spares_what_views_have_lately_shown():
     """MCMC, a base at which the noise is at its largest: whoever was shown since the relocation before the last holds
     still, relocated rows included; with "base" all are shaken."""
     for seen in ("base", "peak"):
-        table = Table(50)
-        for row in range(50):
-            table.set_opacity(row, 0.006)
+        table = Table(50, opacity=0.006)
         rules = strategy("mcmc", opacity_seen=seen, budget=60)
         torch.manual_seed(0)
         table.step(rules, REFINES, shown=0.4, seen=slice(0, 40))
@@ -146,8 +144,7 @@ def test_noise_spares_copies_as_their_source(shown):
     0.6 to 0.1 and more, for at most 8 in a place (1 - 0.4^(1/8) = 0.108). Halved, it is still far above the noise; if
     the 0.3 that a view took from the source were taken from its copies, they would count as invisible."""
     table = Table(50, opacity=0.6)
-    for row in range(25, 50):
-        table.set_opacity(row, 1e-4)
+    table.set_opacity(slice(25, 50), 1e-4)
     rules = strategy("mcmc", budget=50)
     torch.manual_seed(0)
     table.step(rules, REFINES, shown=lambda stored: torch.where(stored > 0.5, shown(stored), 0.0))

@@ -26,8 +26,7 @@ def test_every_tensor_of_the_table_goes_along(name):
     """Small splats with large gradients are duplicated, large ones split, faint ones pruned or moved."""
     table = Table(40, scale=0.001)
     table.splats["scales"].data[10:20] = torch.tensor(0.05).log()
-    for row in range(30, 40):
-        table.set_opacity(row, 0.001)
+    table.set_opacity(slice(30, 40), 0.001)
     rules = strategy(name, opacity_seen="base")
     torch.manual_seed(0)
     table.step(rules, REFINES, gradient=1.0)

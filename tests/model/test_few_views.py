@@ -50,11 +50,8 @@ def test_copies_of_photographs_raise_no_trust(twice, tiny_scene, tmp_path, no_cu
 def test_a_training_goes_on_with_the_views_that_it_counted(twice, tmp_path, no_cuda):
     config = trained(command_line("nrfgs", twice, tmp_path / "new", 2, REFINING))
     pipeline = ready(twice, tmp_path / "again", 4, {"--load-dir": models_of(config)}).pipeline
-    again, spacing = (
-        pipeline.model,
-        camera_spacing(pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]),
-    )
-    trust = 8 / 28
+    again, trust = pipeline.model, 8 / 28
+    spacing = camera_spacing(pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3])
     assert again.num_views == 8 and again.trust == trust
     by_error = ready(twice, tmp_path / "by error", 1, {"--pipeline.model.densification": "error-guided"}).pipeline.model
     assert by_error.densification.config == ErrorGuided().build(16, 8, 1.0).config

@@ -42,11 +42,8 @@ def start(tiny_scene, tmp_path):
 
 def poison(trainer, at: int, name: str, value: float, row: int = 7) -> None:
     """Put a value into the gradient of a per-splat tensor, or into the loss if the name is "loss", at one step."""
-    model, original, check = (
-        trainer.pipeline.model,
-        trainer.pipeline.get_train_loss_dict,
-        trainer.guard.before_optimizers,
-    )
+    pipeline, check = trainer.pipeline, trainer.guard.before_optimizers
+    model, original = pipeline.model, pipeline.get_train_loss_dict
 
     def spoilt(step, *how):
         outputs, losses, metrics = original(step, *how)
@@ -60,7 +57,7 @@ def poison(trainer, at: int, name: str, value: float, row: int = 7) -> None:
             model.gauss_params[name].grad[row] = value
         check(*args)
 
-    trainer.pipeline.get_train_loss_dict, trainer.guard.before_optimizers = spoilt, checked
+    pipeline.get_train_loss_dict, trainer.guard.before_optimizers = spoilt, checked
 
 
 def checkpoints(trainer) -> dict[int, dict]:
