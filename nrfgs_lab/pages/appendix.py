@@ -82,7 +82,7 @@ def trial_changes(sitting: str, middle: bool = False, best: int | None = None) -
     texts = []
     for name, both in sorted(changes.items(), key=lambda one: -fmean(dB for dB, _ in one[1]))[:best]:
         dB, higher = zip(*both, strict=True)
-        mean = f"{signed(fmean(dB), 2)}±{stdev(dB) / len(dB) ** 0.5:.2f}"
+        mean = signed(fmean(dB), 2) + (f"±{stdev(dB) / len(dB) ** 0.5:.2f}" if len(dB) > 1 else "")
         texts.append(f"{name} {signed(median(dB), 2)} dB, SSIM higher on {sum(higher)}" if middle else f"{name} {mean}")
     return "; ".join(texts)
 
@@ -123,12 +123,13 @@ BLOCKS = {
     "tables.default": default,
     "tables.rivals": rivals,
     "tables.gaps": lambda: changes(GAPS, "gaps"),
-    "tables.today": lambda: trial_changes("today", best=2),
+    "tables.today": lambda: trial_changes("today", best=1),
     "tables.fewest": lambda: trial_changes("9 to 12 views"),
     "tables.spread": lambda: trial_changes("spread", best=2),
     "tables.narrow": lambda: trial_changes("narrow"),
     "tables.thresholds": lambda: trial_changes("watch"),
     "tables.watched": watched,
+    "tables.why": lambda: trial_changes("why"),
     "tables.off": lambda: trial_changes("off the image"),
     "tables.harmonics": lambda: trial_changes("today, harmonics", middle=True),
     "tables.scale": scale,
