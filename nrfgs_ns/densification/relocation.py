@@ -78,7 +78,10 @@ def relocate(splats: Splats, optimizers: Optimizers, dead: Tensor, min_opacity: 
     if len(dead_rows) == 0 or len(live_rows) == 0:
         return source
     source[dead_rows] = chosen = _share_places(splats, live_rows, len(dead_rows), min_opacity)
-    moments = lambda _, old: old.index_fill(0, chosen, 0.0)  # noqa: E731
+
+    def moments(_: str, old: Tensor) -> Tensor:
+        return old.index_fill(0, chosen, 0.0)
+
     _update_param_with_optimizer(lambda _, old: Parameter(old.detach()[source]), moments, splats, optimizers)
     return source
 
@@ -96,7 +99,10 @@ def add_samples(splats: Splats, optimizers: Optimizers, count: int, min_opacity:
     if count <= 0:
         return rows
     source = torch.cat([rows, _share_places(splats, rows, count, min_opacity)])
-    moments = lambda _, old: torch.cat([old, old.new_zeros(count, *old.shape[1:])])  # noqa: E731
+
+    def moments(_: str, old: Tensor) -> Tensor:
+        return torch.cat([old, old.new_zeros(count, *old.shape[1:])])
+
     _update_param_with_optimizer(lambda _, old: Parameter(old.detach()[source]), moments, splats, optimizers)
     return source
 
