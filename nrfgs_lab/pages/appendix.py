@@ -130,6 +130,7 @@ BLOCKS = {
     "tables.thresholds": lambda: trial_changes("watch"),
     "tables.watched": watched,
     "tables.why": lambda: trial_changes("why"),
+    "tables.why_longer": lambda: trial_changes("why, 6,000 steps"),
     "tables.off": lambda: trial_changes("off the image"),
     "tables.harmonics": lambda: trial_changes("today, harmonics", middle=True),
     "tables.scale": scale,
