@@ -12,6 +12,9 @@ from nrfgs_lab.pages.speed import RENDERERS, scale_cells
 
 RIVALS = {"3DGS's": ORIGINAL, "splatfacto's": "splatfacto", "MCMC's, 150,000 splats": "mcmc@150000_refine_every_50"}
 """Label -> strategy in results/default.json."""
+HEADS = "linear basis", "field without opacity residual", "linear basis with opacity residual", "field"
+HEADS = {"harmonics, 4 times the rate": "4 times the rate"} | dict(zip(HEADS, HEADS, strict=True))
+"""Label -> trial of rates in results/trials.json; its default are harmonics."""
 GAPS = {"**twice the residual, on the logit**: `nrfgs`": "twice on the logit", "harmonics without noise": "harmonics"}
 """Label -> trial with gaps in results/trials.json; its default added the residual to the opacity."""
 
@@ -37,14 +40,13 @@ def _metrics(runs: Trainings) -> list[str]:
 
 
 def rivals() -> str:
-    """Today's default beside other rules of densification, on test views: mean PSNR, that of the median view, SSIM."""
-
-    def values(runs: Trainings) -> str:
-        ssim, _, _, middle, *_ = _metrics(runs)
-        return f"{mean(runs, 'psnr'):.2f}/{middle}/{ssim}"
-
-    body = [[scene, *(values(today(scene, FIELD, rule)) for rule in (OWN, *RIVALS.values()))] for scene in VIEWS]
-    return grid(["", "`nrfgs`", *RIVALS], body)
+    """Each densification on test views: the field's mean PSNR, that of the median view, SSIM; harmonics' mean PSNR."""
+    rules, body = (OWN, *RIVALS.values()), []
+    for scene in VIEWS:
+        field = [(mean(runs, "psnr"), _metrics(runs)) for runs in (today(scene, FIELD, rule) for rule in rules)]
+        harmonics = "/".join(f"{mean(today(scene, SAME, rule), 'psnr'):.2f}" for rule in rules)
+        body.append([scene, *(f"{psnr:.2f}/{cells[3]}/{cells[0]}" for psnr, cells in field), harmonics])
+    return grid(["", "`nrfgs`", *RIVALS, "harmonics, these four"], body)
 
 
 def _changes(sitting: str, trial: str) -> dict[str, tuple[float, float, float]]:
@@ -127,10 +129,8 @@ BLOCKS = {
     "tables.fewest": lambda: trial_changes("9 to 12 views"),
     "tables.spread": lambda: trial_changes("spread", best=2),
     "tables.narrow": lambda: trial_changes("narrow"),
-    "tables.thresholds": lambda: trial_changes("watch"),
     "tables.watched": watched,
-    "tables.why": lambda: trial_changes("why"),
-    "tables.why_longer": lambda: trial_changes("why, 6,000 steps"),
+    "tables.heads": lambda: changes(HEADS, "rates"),
     "tables.off": lambda: trial_changes("off the image"),
     "tables.harmonics": lambda: trial_changes("today, harmonics", middle=True),
     "tables.scale": scale,
