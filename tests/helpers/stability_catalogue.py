@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 import tyro
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / "rasterizer"))
+sys.path += [str(Path(__file__).resolve().parents[1] / folder) for folder in ("rasterizer", "fixtures")]
 
 from gsplat_call import rasterization
 from rich.console import Console
