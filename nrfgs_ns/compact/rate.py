@@ -95,5 +95,5 @@ def _earlier(values: Tensor, count: int) -> Tensor:
 def bits_of_places(means: Tensor, steps: Tensor) -> Tensor:
     """Bits of one of N means [N, 3]: the choice of a cell of size `steps` [3] in their box, in any order."""
     extent = (means.detach().amax(dim=0) - means.detach().amin(dim=0)).clamp_min(1e-30)
-    cells = (extent.log() - steps.log()).sum() / math.log(2.0)
-    return cells - math.log2(max(len(means), 1)) + 1.0 / math.log(2.0)
+    cells = (extent.log() - steps.log()).clamp_min(0.0).sum() / math.log(2.0)
+    return (cells - math.log2(max(len(means), 1)) + 1.0 / math.log(2.0)).clamp_min(0.0)

@@ -68,7 +68,8 @@ class Splatfacto(GradientConfig):
 
     def check(self) -> None:
         super().check()
-        self.require(self.cull_alpha_thresh < 0.5, "cull_alpha_thresh", "below 0.5, since a reset is to twice as much")
+        resets = "below 0.5 and above 0, since a reset is to twice as much"
+        self.require(0 < self.cull_alpha_thresh < 0.5, "cull_alpha_thresh", resets)
         for name, fixed in (("use_absgrad", True), ("stop_screen_size_at", 4000)):  # in an older config.yml
             self.require(getattr(self, name, fixed) == fixed, name, f"{fixed}, its only value")
 

@@ -14,7 +14,10 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from scipy.sparse import csr_array, eye_array
+from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
 from nrfgs_ns.image.photograph import GAMMA, TOE
@@ -215,20 +218,25 @@ def estimate(pairs: Pairs, known: Tensor, centers: Tensor) -> Looks:
         usual = random if any(random) else usual
     elif len(pairs.first) >= FEWEST_PAIRS:
         places = _places(centers)
-    eye = torch.eye(count, dtype=torch.float64)
-    difference = eye[pairs.second] - eye[pairs.first]
+    size, ones = len(pairs.first), np.ones(len(pairs.first))
+    ends = np.tile(np.arange(size), 2), torch.cat([pairs.second, pairs.first]).numpy()
+    difference = csr_array((np.concatenate([ones, -ones]), ends), shape=(size, count))
     stops, held = torch.empty_like(expected), []
     for column in range(3):
-        weight = pairs.spread[:, column].double().clamp_min(SMALLEST_SPREAD) ** -2
-        missing = pairs.shift[:, column].double() - difference @ expected[:, column]
-        precision = difference.T @ (weight[:, None] * difference)
+        weight = pairs.spread[:, column].double().clamp_min(SMALLEST_SPREAD).numpy() ** -2
+        missing = pairs.shift[:, column].double().numpy() - difference @ expected[:, column].numpy()
+        precision = difference.T @ difference.multiply(weight[:, None]).tocsr()
         seen = difference.T @ (weight * missing)
-        variance, total, patterns = usual[column] ** 2, usual[column] ** 2 * eye, _constant(count)
-        if places is not None:
+        # mean of s given the pairs: cov(s, d) (cov(d) + precision^-1)^-1, written without inverting the precision
+        if places is None:
+            variance, patterns = usual[column] ** 2, _constant(count)
+            own = torch.from_numpy(spsolve((eye_array(count) + variance * precision).tocsc(), seen))
+        else:
+            precision, seen = torch.from_numpy(precision.toarray()), torch.from_numpy(seen)
             variance, total, patterns = _split(places, precision, seen)
             random[column] = math.sqrt(variance)
-        # mean of s given the pairs: cov(s, d) (cov(d) + precision^-1)^-1, written without inverting the precision
-        stops[:, column] = expected[:, column] + variance * torch.linalg.solve(eye + precision @ total, seen)
+            own = torch.linalg.solve(torch.eye(count, dtype=torch.float64) + precision @ total, seen)
+        stops[:, column] = expected[:, column] + variance * own
         held.append(patterns.float())
     stops -= stops.mean(dim=0)
     return Looks(stops.float(), tuple(held), tuple(random))

@@ -51,7 +51,7 @@ def photograph_model(config: Any, datamanager: Any) -> PhotographModel | None:
     if choice == "off":
         return None
     dataset, metadata = datamanager.train_dataset, datamanager.train_dataparser_outputs.metadata
-    exif = torch.tensor([exposure(entry) for entry in exif_of(dataset.image_filenames, metadata.get("exif"))])
+    exif = exposures(exif_of(dataset.image_filenames, metadata.get("exif")))
     pairs = compare_photographs(metadata.get("points3D_xyz"), dataset.cameras, datamanager.cached_train)
     centers = dataset.cameras.camera_to_worlds[:, :3, 3].cpu()
     seen = estimate(pairs, torch.full_like(exif, torch.nan), centers)
@@ -84,6 +84,15 @@ def check_same_photographs(own: PhotographModel | None, written: Mapping[str, An
 def exif_of(paths: Sequence[Path], stored: Sequence[Exif] | None) -> list[Exif]:
     """EXIF of each photograph from the data set, or else from its file. [V]"""
     return [entry or read_exif(path) for path, entry in zip(paths, stored or [{}] * len(paths), strict=True)]
+
+
+def exposures(exif: Sequence[Exif]) -> Tensor:
+    """Photographs' exposures in stops, up to a constant; NaN where unknown. Those with and those without an aperture,
+    as of manual lenses, cannot be compared: the fewer are unknown. [V]"""
+    stops = torch.tensor([exposure(entry) for entry in exif])
+    has_aperture = torch.tensor(["f_number" in entry for entry in exif])
+    most_have = bool(has_aperture[torch.isfinite(stops)].double().mean() >= 0.5)
+    return stops.where(has_aperture == most_have, torch.nan)
 
 
 def exposure(exif: Exif) -> float:

@@ -244,6 +244,14 @@ def test_splats_that_go_take_what_an_optimizer_knows_of_them_along():
         assert torch.equal(optimizer.state[table.values]["exp_avg"], moments[kept])
 
 
+def test_splats_in_a_plane_or_at_one_place_take_no_fewer_bits_than_none():
+    """Their logarithm adapts the rate to a size."""
+    means, steps = torch.rand(50, 3), torch.full((3,), 1e-3)
+    flat = bits_of_places(means * torch.tensor([1.0, 1.0, 0.0]), steps)
+    assert 12 < flat < bits_of_places(means, steps) - 8
+    assert bits_of_places(means[:1].expand(50, 3), steps) == 0
+
+
 def test_what_training_expects_is_what_a_file_has(tmp_path):
     torch.manual_seed(0)
     values = torch.distributions.Laplace(0.0, torch.tensor([0.1, 1.0, 3.0])).sample((20_000,))

@@ -128,6 +128,7 @@ def test_a_word_is_a_strategy_with_its_options(text, config, tmp_path):
     ("original,opacity_seen=sparkle", "'sparkle'; use one of base, peak"),
     ("splatfacto,densify_grad_thresh=nan", "densify_grad_thresh is nan; it must be zero or positive"),
     ("splatfacto,cull_alpha_thresh=0.5", "cull_alpha_thresh is 0.5; it must be below 0.5"),
+    ("splatfacto,cull_alpha_thresh=0", "cull_alpha_thresh is 0.0; it must be below 0.5 and above 0"),
     ("splatfacto,refine_every=0", "refine_every is 0; it must be at least 1"),
 ])  # fmt: skip
 def test_options_that_cannot_work_are_refused(text, says):

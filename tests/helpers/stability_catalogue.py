@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 import tyro
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / "rasterizer"))
+sys.path += [str(Path(__file__).resolve().parents[1] / folder) for folder in ("rasterizer", "fixtures")]
 
 from gsplat_call import rasterization
 from rich.console import Console
@@ -23,15 +23,8 @@ from rich.markup import escape
 from rich.table import Table
 from torch import Tensor
 
+from nrfgs_ns.appearance import nrf
 from nrfgs_ns.appearance.head import base_colors
-from nrfgs_ns.appearance.nrf import (
-    OPACITY_BOUNDS,
-    NeuralResidualField,
-    NrfConfig,
-    bounded_opacity,
-    fourier_bands,
-    view_geometry,
-)
 from nrfgs_ns.rasterizer import Projection, ProjectionOptions, project
 from nrfgs_ns.rasterizer.torch_cpu.projection import LARGEST_RADIUS, MIN_QUATERNION
 from nrfgs_ns.training.guard import MAX_GRADIENT
@@ -97,7 +90,7 @@ def harmless(**changed: list[float] | float) -> bool:
 def field(latent: float = 0.1, weight: float = 1.0, distance: float = 2.0) -> bool:
     """Whether the field is finite, in range and has finite gradients, for latents and weights of a size."""
     torch.manual_seed(0)
-    head: NeuralResidualField = NrfConfig(output_init="default", implementation="torch").setup()
+    head: nrf.NeuralResidualField = nrf.NrfConfig(output_init="default", implementation="torch").setup()
     with torch.no_grad():
         for weights in head.parameters():
             weights *= weight
@@ -114,9 +107,8 @@ def field(latent: float = 0.1, weight: float = 1.0, distance: float = 2.0) -> bo
 def opacity_ends() -> bool:
     """Whether every bound keeps opacities of logits from -1e4 to 1e4 within [0, 1]."""
     logits = torch.tensor([[-1e4], [-20.0], [0.0], [20.0], [1e4]])
-    bounded = [
-        bounded_opacity(logits, t, 0.2, b) for b in OPACITY_BOUNDS for t in (-torch.ones(5, 1), torch.ones(5, 1))
-    ]
+    ends = torch.ones(5, 1)
+    bounded = [nrf.bounded_opacity(logits, t, 0.2, b) for b in nrf.OPACITY_BOUNDS for t in (-ends, ends)]
     return all(bool(((x >= 0) & (x <= 1)).all()) for x in bounded)
 
 
@@ -131,7 +123,7 @@ def adam_at(gradient: float) -> bool:
 
 def geometry(means: list[float]) -> tuple[Tensor, Tensor]:
     """Direction and log distance from a mean to a camera at the origin."""
-    return view_geometry(torch.tensor([means]), torch.zeros(3), 0.01)
+    return nrf.view_geometry(torch.tensor([means]), torch.zeros(3), 0.01)
 
 
 CATALOGUE = [
@@ -228,7 +220,7 @@ CATALOGUE = [
         "rounding grows with 2^k: 2^k pi 10 units, 8e-6 for band 2",
         (f"{HEAD}::test_direction_distance_and_bands_agree_with_float64",),
         lambda: bool(
-            (fourier_bands(torch.ones(1, 3), 3)[1].double() - fourier_bands(torch.ones(1, 3).double(), 3)[1])
+            (nrf.fourier_bands(torch.ones(1, 3), 3)[1].double() - nrf.fourier_bands(torch.ones(1, 3).double(), 3)[1])
             .abs()
             .max()
             < 8e-6

@@ -2,12 +2,13 @@
 """Photographs of known exposure of a painted wall, from places next to each other."""
 
 import math
+from time import perf_counter
 
 import pytest
 import torch
 
 from nrfgs_ns.image import overlap
-from nrfgs_ns.image.overlap import ENOUGH_KNOWN_STOPS, ENOUGH_STOPS, compare, estimate, sight, slope, spread
+from nrfgs_ns.image.overlap import ENOUGH_KNOWN_STOPS, ENOUGH_STOPS, Pairs, compare, estimate, sight, slope, spread
 from nrfgs_ns.image.photograph import BASIS, exposed
 
 WIDTH, HEIGHT, FOCAL = 120, 90, 110.0
@@ -104,6 +105,14 @@ def test_of_a_large_capture_a_part_says_how_photographs_differ(monkeypatch):
     assert error(looks, stops) < 0.2
     assert all(pattern.shape == (24, 1) for pattern in looks.held)
     assert not any(enough(looks_of(torch.zeros(24, 3))))
+
+
+def test_thousands_of_photographs_take_a_moment():
+    stops, first = torch.randn(5000, 3) * 0.3, torch.arange(10_000) % 5000
+    second = (first + 1 + torch.arange(10_000) // 5000) % 5000
+    pairs, begin = Pairs(first, second, stops[second] - stops[first], torch.full((10_000, 3), 0.02)), perf_counter()
+    looks = estimate(pairs, torch.full((5000,), UNKNOWN), places(5000))
+    assert perf_counter() - begin < 20 and (looks.stops - stops + stops.mean(dim=0)).abs().max() < 0.2
 
 
 def test_hidden_points_and_dark_or_bright_pixels_are_left_out():

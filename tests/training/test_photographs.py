@@ -15,7 +15,7 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.overlap import Pairs, estimate
 from nrfgs_ns.image.photograph import BASIS, exposed
 from nrfgs_ns.trained.loading import load_model
-from nrfgs_ns.training.photographs import exif_of, exposure, they_differ
+from nrfgs_ns.training.photographs import exif_of, exposure, exposures, they_differ
 
 NAN = math.nan
 
@@ -48,6 +48,7 @@ def test_exposure_in_stops_of_exif_from_the_data_set_or_else_from_the_file(tmp_p
     assert exposure({**exif, "exposure_time": 0.02, "iso": 200}) - exposure(exif) == pytest.approx(2.0)
     assert exposure({**exif, "f_number": 2.0}) - exposure(exif) == pytest.approx(2.0)
     assert math.isnan(exposure({"f_number": 2.0, "iso": 100})) and math.isnan(exposure({}))
+    assert exposures([exif, {}, exif, {"exposure_time": 0.01, "iso": 100}]).isnan().tolist() == [0, 1, 0, 1]
     photo = tmp_path / "a.jpg"
     exif = Image.Exif()
     exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.ExposureTime] = 0.25
