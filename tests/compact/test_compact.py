@@ -30,6 +30,7 @@ from nrfgs_ns.compact.tables import NEAR, OCTAHEDRAL, STEPS, Grid, from_morton, 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Export
 from nrfgs_ns.trained.loading import load_file, load_model
+from nrfgs_ns.training.config_file import read_config
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -186,6 +187,17 @@ def test_nerfstudios_commands_read_the_file(exported, tmp_path):
     assert (spread.diff() < 1e-3).all() and spread[0] > 1.5 * spread[-1], "principal components, the strongest first"
     DatasetRender(load_config=config, output_path=tmp_path / "renders", image_format="png").main()
     assert len(list((tmp_path / "renders" / "test" / "rgb").rglob("*.png"))) == 2
+
+
+def test_the_files_config_is_read_from_any_folder(exported, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    compact(exported[0], Path("it.nrf"), "--no-measure")
+    config = tmp_path / "it.nrf.nerfstudio" / "nrfgs" / "compact" / "config.yml"
+    monkeypatch.chdir("/")
+    assert read_config(config).get_checkpoint_dir() == config.parent / "nerfstudio_models", "nerfstudio looks there"
+    load_model(config, "test")
+    with pytest.raises(InputError, match=f"is a compact file. Name {config}"):
+        load_model(tmp_path / "it.nrf", "test")
 
 
 def test_a_training_does_not_begin_with_a_compact_file(exported, tiny_scene, tmp_path):
