@@ -238,12 +238,19 @@ def test_what_ns_train_says_before_it_begins(tiny_scene, tmp_path, monkeypatch, 
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match="--data is missing"):
         parse(["nrfgs"]).print_to_terminal()
+    with pytest.raises(InputError, match="typo: no such file or folder"):  # and no folder is made for it
+        parse(["nrfgs", "--data", "typo"]).print_to_terminal()
     monkeypatch.chdir(tiny_scene)
     for words in ([], ["nrfgs-data", "--data", str(tiny_scene)]):
         config = parse(["nrfgs", *words])
         capsys.readouterr()
         config.print_to_terminal()
         assert capsys.readouterr().out.splitlines() == [f"nrfgs on {tiny_scene}"]
+
+
+def test_on_a_cpu_smaller_images_are_advised_where_they_are_large(tiny_scene, tmp_path, capsys):
+    ready(tiny_scene, tmp_path, steps=10_000)
+    assert "in ten minutes: nrfgs-fast with --time-budget 10\n" in capsys.readouterr().out
 
 
 # Signals and states, without a training.
