@@ -14,7 +14,8 @@ from importlib.util import find_spec
 
 import tyro
 
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import DEBUG, InputError
+from nrfgs_ns.files import NO_ROOM
 
 GROUP = "nrfgs.commands"
 
@@ -65,8 +66,11 @@ def entrypoint() -> None:
     warnings.filterwarnings("ignore", "Converting a tensor with requires_grad=True to a scalar")
     try:
         chosen(sys.argv[1:]).main()
-    except (InputError, FileExistsError) as error:
-        sys.exit(f"nrfgs: {error}")
+    except (InputError, OSError) as error:
+        no_room = getattr(error, "errno", None) in NO_ROOM
+        if DEBUG or not (no_room or isinstance(error, (InputError, FileExistsError))):
+            raise
+        sys.exit(f"nrfgs: {error}" + ". Make room, or write elsewhere." * no_room)
     except KeyboardInterrupt:
         print("nrfgs: stopped", file=sys.stderr)
         sys.exit(130)
