@@ -99,6 +99,16 @@ def test_a_commands_traceback_is_shown_when_asked_for():
     assert "Traceback" in subprocess.run(words, capture_output=True, text=True, env=environment, timeout=300).stderr
 
 
+def test_a_reader_that_has_ended_is_no_error():
+    """nrfgs doctor | head -1"""
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "wb") as pipe:
+        words = [sys.executable, "-u", "-m", "nrfgs_ns.cli", "--help"]
+        run = subprocess.run(words, stdout=pipe, stderr=subprocess.PIPE, text=True, timeout=300)
+    assert (run.returncode, run.stderr) == (141, "")
+
+
 def test_writers_do_not_meet(tmp_path):
     """Four writers and a reader: nobody fails, and what is read is what one of them wrote."""
     file, texts = tmp_path / "table.md", [letter * 200_000 for letter in "abcd"]
