@@ -41,9 +41,8 @@ def summary(command: EntryPoint) -> str:
 def listing() -> str:
     """The help of `nrfgs` itself."""
     lines = [f"  {name:<10}{summary(entry)}" for name, entry in commands().items()]
-    return "\n".join(
-        ["usage: nrfgs COMMAND [OPTIONS]", "", *lines, "", "`nrfgs COMMAND --help` explains a command's options."]
-    )
+    lines = ["usage: nrfgs COMMAND [OPTIONS]", "", *lines, "", "`nrfgs COMMAND --help` explains a command's options."]
+    return "\n".join(lines)
 
 
 def chosen(arguments: list[str]):

@@ -43,7 +43,7 @@ def whole(path: Path) -> Iterator[Path]:
         yield aside
         os.replace(aside, path)
     except OSError as error:  # of a full disk the system does not say which file was written
-        if error.errno in NO_ROOM and error.filename is None:
+        if error.errno in NO_ROOM:
             error.filename = str(path)
         raise
     finally:

@@ -56,8 +56,7 @@ def read_config(path: Path) -> TrainerConfig:
     if not path.is_file():
         raise InputError(f"{path}: no such file. {fix}.")
     if (data := path.read_bytes()).startswith(MAGIC):
-        its_own = f"{path}.nerfstudio/nrfgs/compact/config.yml"
-        raise InputError(f"{path} is a compact file. Name {its_own}, which was written beside it.")
+        raise InputError(f"{path} is a compact file. Name {path}.nerfstudio/nrfgs/compact/config.yml instead.")
     try:
         config = yaml.load(data.decode(), Loader=_Loader)
     except (yaml.YAMLError, RecursionError, ValueError, TypeError, LookupError, AttributeError) as error:

@@ -198,7 +198,6 @@ def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool)
         CONSOLE.print(f"Images are read at {size}, {width} x {height} (--downscale-factor: docs/own-data.md).", **PLAIN)
     is_long = config.time_budget is None and config.max_num_iterations >= FEWEST_STEPS
     if config.machine.device_type == "cpu" and is_long and config.pipeline.datamanager.camera_res_scale_factor == 1:
-        scale = round(LONGEST_SIDE / max(width, height), 2)
-        smaller = f" --pipeline.datamanager.camera-res-scale-factor {scale:.2g}" if scale < 1 else ""
-        words = f"nrfgs-fast with --time-budget 10{smaller}"
+        scale, words = round(LONGEST_SIDE / max(width, height), 2), "nrfgs-fast with --time-budget 10"
+        words += f" --pipeline.datamanager.camera-res-scale-factor {scale:.2g}" * (scale < 1)
         CONSOLE.print(f"No CUDA device: the CPU trains. A result in ten minutes: {words}", **PLAIN)

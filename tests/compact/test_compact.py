@@ -84,8 +84,7 @@ def test_every_number_comes_back_within_half_a_step(tmp_path):
     quats, scales = nearest_turn(truth["quats"].double().numpy(), truth["scales"].double().numpy())
     truth |= {"quats": torch.from_numpy(quats).float(), "scales": torch.from_numpy(scales).float()}
     # Half a step, and float32's rounding of numbers below 16: 2^-20.
-    rounding = 2.0**-20
-    median = one.splats["scales"].mean(dim=1).median().exp().item()
+    rounding, median = 2.0**-20, one.splats["scales"].mean(dim=1).median().exp().item()
     assert (read["means"] - truth["means"]).abs().max() <= STEPS["means"] * median / 2 + rounding
     assert (read["scales"] - truth["scales"]).abs().max() <= STEPS["scales"] / 2 + rounding
     cut = truth["opacities"].clamp(-LARGEST_LOGIT, LARGEST_LOGIT)

@@ -139,8 +139,7 @@ def test_another_failure_saves_too_and_is_raised(disk_is_full, tiny_scene, tmp_p
 
 def test_a_signal_in_the_last_step_finds_a_training_that_is_done(finished, tiny_scene, tmp_path, monkeypatch, capsys):
     """With the mean over the last steps, and without a viewer that would wait for another signal."""
-    trainer = ready(tiny_scene, tmp_path)
-    waited = []
+    trainer, waited = ready(tiny_scene, tmp_path), []
     monkeypatch.setattr("nerfstudio.engine.trainer.Trainer._train_complete_viewer", lambda _: waited.append(True))
     at_step(trainer, STEPS - 1, lambda: os.kill(os.getpid(), signal.SIGTERM))
     trainer.train()
