@@ -49,6 +49,8 @@ class Inspect(NamesTraining):
         config = self.config()
         output = self.output or config.parent / "inspect.json"
         check_writable(output, "--output")
+        if not self.budget >= 0:
+            raise InputError(f"--budget is {self.budget}; it must be zero or positive.")
         pipeline = load_model(config, "test", measured=True)
         model, cameras = pipeline.model, pipeline.datamanager.train_dataset.cameras
         if not isinstance(model.head, NeuralResidualField):

@@ -7,6 +7,7 @@ command that runs is imported; the list reads the others' docstrings from their 
 
 import ast
 import difflib
+import os
 import sys
 import warnings
 from importlib.metadata import EntryPoint, entry_points
@@ -14,7 +15,8 @@ from importlib.util import find_spec
 
 import tyro
 
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import DEBUG, InputError
+from nrfgs_ns.files import NO_ROOM
 
 GROUP = "nrfgs.commands"
 
@@ -39,9 +41,8 @@ def summary(command: EntryPoint) -> str:
 def listing() -> str:
     """The help of `nrfgs` itself."""
     lines = [f"  {name:<10}{summary(entry)}" for name, entry in commands().items()]
-    return "\n".join(
-        ["usage: nrfgs COMMAND [OPTIONS]", "", *lines, "", "`nrfgs COMMAND --help` explains a command's options."]
-    )
+    lines = ["usage: nrfgs COMMAND [OPTIONS]", "", *lines, "", "`nrfgs COMMAND --help` explains a command's options."]
+    return "\n".join(lines)
 
 
 def chosen(arguments: list[str]):
@@ -65,8 +66,14 @@ def entrypoint() -> None:
     warnings.filterwarnings("ignore", "Converting a tensor with requires_grad=True to a scalar")
     try:
         chosen(sys.argv[1:]).main()
-    except (InputError, FileExistsError) as error:
-        sys.exit(f"nrfgs: {error}")
+    except BrokenPipeError:  # as of `nrfgs doctor | head -1`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python writes the rest when it ends
+        sys.exit(141)
+    except (InputError, OSError) as error:
+        no_room = getattr(error, "errno", None) in NO_ROOM
+        if DEBUG or not (no_room or isinstance(error, (InputError, FileExistsError))):
+            raise
+        sys.exit(f"nrfgs: {error}" + ". Make room, or write elsewhere." * no_room)
     except KeyboardInterrupt:
         print("nrfgs: stopped", file=sys.stderr)
         sys.exit(130)

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """The top of the package: `nrfgs`, listed and refused without importing torch; messages, and files written whole."""
 
+import errno
 import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from nrfgs_ns import cli
 from nrfgs_ns.cli import commands, summary
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import check_writable, whole, write_whole
@@ -91,6 +94,21 @@ def test_it_is_the_last_line_and_the_status_1(debug):
         assert run.stderr == "x.json is missing. Make one.\n"
 
 
+def test_a_commands_traceback_is_shown_when_asked_for():
+    environment, words = {**os.environ, "NRFGS_DEBUG": "1"}, [sys.executable, "-m", "nrfgs_ns.cli", "no-such"]
+    assert "Traceback" in subprocess.run(words, capture_output=True, text=True, env=environment, timeout=300).stderr
+
+
+def test_a_reader_that_has_ended_is_no_error():
+    """nrfgs doctor | head -1"""
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "wb") as pipe:
+        words = [sys.executable, "-u", "-m", "nrfgs_ns.cli", "--help"]
+        run = subprocess.run(words, stdout=pipe, stderr=subprocess.PIPE, text=True, timeout=300)
+    assert (run.returncode, run.stderr) == (141, "")
+
+
 def test_writers_do_not_meet(tmp_path):
     """Four writers and a reader: nobody fails, and what is read is what one of them wrote."""
     file, texts = tmp_path / "table.md", [letter * 200_000 for letter in "abcd"]
@@ -109,6 +127,16 @@ def test_a_write_that_fails_leaves_the_older_file(tmp_path):
         aside.write_text("ne")
         raise OSError("disk full")
     assert file.read_text() == "old" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_full_disk_is_told_without_a_traceback(tmp_path, monkeypatch):
+    def main():
+        with whole(tmp_path / "page.html"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(cli, "chosen", lambda _: SimpleNamespace(main=main))
+    with pytest.raises(SystemExit, match="No space left on device: .*page.html.* Make room"):
+        cli.entrypoint()
 
 
 def test_what_cannot_be_written_is_told_beforehand(tmp_path):

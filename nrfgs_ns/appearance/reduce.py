@@ -43,8 +43,7 @@ def latent_basis(field: Field, weight: Tensor) -> LatentBasis:
     if not float(weight.sum()) > 0:
         weight = torch.ones_like(weight)
     weight = (weight / weight.sum()).double()[:, None]
-    mean = (weight * latents).sum(dim=0)
-    size = latents.shape[1]
+    mean, size = (weight * latents).sum(dim=0), latents.shape[1]
     weights = field.head.state_dict()
     first_layers = torch.cat([weights[f"{branch}.0.weight"][:, :size].double() for branch in branches(weights)])
     gram = first_layers.T @ first_layers

@@ -115,8 +115,7 @@ def _photograph(id: int, pose: Sequence[float], camera: int, name: str) -> Photo
 
 
 def _images_text(path: Path) -> list[Photograph]:
-    photographs = []
-    lines = iter(path.read_text(encoding="utf-8").splitlines())
+    photographs, lines = [], iter(path.read_text(encoding="utf-8").splitlines())
     for line in lines:
         if line.strip() and not line.lstrip().startswith("#"):
             id, *pose, camera, name = line.split(maxsplit=9)

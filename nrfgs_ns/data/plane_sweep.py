@@ -213,8 +213,7 @@ def dense_points(
 def _agreed(views: Views, inverse: Tensor, good: Tensor, one: int, others: Tensor) -> tuple[Tensor, Tensor]:
     """Points of a view that `AGREEING` others have at the same depth. Takes their pixels out of `good`, so that each
     point comes once."""
-    chosen = good[one]
-    world = torch.linalg.inv(views.world_to_camera[one])
+    chosen, world = good[one], torch.linalg.inv(views.world_to_camera[one])
     xyz = _rays(views, one)[chosen] / inverse[one][chosen][:, None] @ world[:3, :3].T + world[:3, 3]
     (height, width), pixels, same = good.shape[1:], [], []
     for other in others.tolist():

@@ -70,8 +70,7 @@ def nearest_depth(points: Tensor, cameras: Cameras) -> float:
         points: of the capture, [P, 3].
         cameras: pinhole cameras of the training, [V].
     """
-    points = points[:: max(len(points) // 10_000, 1)].float()
-    nearest = math.inf
+    points, nearest = points[:: max(len(points) // 10_000, 1)].float(), math.inf
     for camera in cameras:
         rotation, position = camera.camera_to_worlds[:3, :3], camera.camera_to_worlds[:3, 3]
         x, y, z = ((points - position) @ rotation).unbind(-1)

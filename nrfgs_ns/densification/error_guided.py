@@ -133,8 +133,7 @@ class ErrorGuidedDensification(Densification):
         opacities, wide = self.seen_opacity(splats["opacities"]), state[WIDTH] > WIDEST
         dead = opacities < DEAD
         parents = draw((opacities * (state[WIDTH] > 0)).masked_fill(dead, 0.0), int(dead.sum()))
-        places = dead.nonzero()[:, 0][: len(parents)]
-        grown = parents[:0]
+        places, grown = dead.nonzero()[:, 0][: len(parents)], parents[:0]
         if step < self.grow_until:
             weights, wanted = self._candidates(step, count, dead, wide, len(places))
             wanted = self.fitting(step, info, splats, optimizers, max(min(wanted, self.config.most_splats - count), 0))

@@ -191,8 +191,7 @@ class GradientDensification(Densification):
             largest = gradients.kthvalue(count - room).values.item()  # the threshold is exclusive
             strategy.grow_grad2d, strategy.grow_scale2d = max(threshold, largest), math.inf
         duplicated, split = strategy._grow_gs(splats, optimizers, state, step)
-        grown = len(splats["means"])
-        pruned = 0
+        grown, pruned = len(splats["means"]), 0
         if not self.budget or step % strategy.reset_every >= RECOVERY * strategy.refine_every:
             pruned = strategy._prune_gs(splats, optimizers, state, step)
         if self.verbose:

@@ -44,8 +44,7 @@ def split_evenly(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Ten
     n = copies.clamp(1, MAX_COPIES)
     # float64, and o short of 1: the terms alternate, and for n = 51 they are up to 1e5 times as large as their sum.
     o = opacities.double().clamp_max(1.0 - torch.finfo(torch.float32).eps)
-    each = -torch.expm1(torch.log1p(-o) / n)
-    k = torch.arange(MAX_COPIES, device=o.device)
+    each, k = -torch.expm1(torch.log1p(-o) / n), torch.arange(MAX_COPIES, device=o.device)
     signs = (1.0 - 2.0 * (k % 2)) / (k + 1.0).sqrt()
     terms = _BINOMIALS.to(o.device)[n] * signs * each[:, None] ** (k + 1)  # [M, 51]
     factor = o / terms.sum(dim=-1)

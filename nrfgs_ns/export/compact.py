@@ -181,13 +181,12 @@ def too_small(limit: float, smallest: int) -> InputError:
 
 def write_config(load_config: Path, output: Path, head: NrfConfig) -> Path:
     """Write what nerfstudio's commands need to read FILE.nrf into FILE.nrf.nerfstudio/METHOD/compact: a config.yml,
-    whose path is returned, and an empty checkpoint. Relative paths stay relative, as nerfstudio's."""
+    whose path is returned, and an empty checkpoint. Its paths are absolute, as those of trainings."""
     config = read_config(load_config)
     find_data(config, load_config)
     config.output_dir, config.experiment_name, config.timestamp = output.parent, f"{output.name}.nerfstudio", "compact"
     config.relative_model_dir = Path("nerfstudio_models")
     config.load_dir = config.load_checkpoint = config.load_step = None
-    config.pipeline.compact = output
     config.pipeline.model.appearance = head
     config.pipeline.model.camera_optimizer.mode = "off"
     models = config.get_checkpoint_dir()
@@ -197,5 +196,6 @@ def write_config(load_config: Path, output: Path, head: NrfConfig) -> Path:
     step = max(config.max_num_iterations, 1) - 1
     torch.save({"step": step, "pipeline": {}}, models / f"step-{step:09d}.ckpt")
     path = config.get_base_dir() / "config.yml"
+    config.output_dir, config.pipeline.compact = output.parent.absolute(), output.absolute()
     write_whole(path, yaml.dump(config))
     return path

@@ -94,8 +94,7 @@ def sight(points: Tensor, viewmat: Tensor, K: Tensor, image: Tensor, mask: Tenso
     points, viewmat, K = (value.to(image.device, torch.float32) for value in (points, viewmat, K))
     # Not as matrix products: cuBLAS would keep 32 MiB of a GPU for each thread that asks for one.
     seen = (points[:, None] * viewmat[:3, :3]).sum(dim=-1) + viewmat[:3, 3]
-    depth = seen[:, 2]
-    pixel = (seen[:, None] * K).sum(dim=-1)
+    depth, pixel = seen[:, 2], (seen[:, None] * K).sum(dim=-1)
     x, y = pixel[:, 0] / depth, pixel[:, 1] / depth
     rows = ((depth > 0) & (x >= window) & (x < width - window) & (y >= window) & (y < height - window)).nonzero()[:, 0]
     x, y, depth = x[rows].long(), y[rows].long(), depth[rows]
@@ -205,8 +204,7 @@ def estimate(pairs: Pairs, known: Tensor, centers: Tensor) -> Looks:
         centers: of the cameras. [V, 3]
     """
     count = len(known)
-    expected = torch.zeros(count, 3, dtype=torch.float64)
-    there = torch.isfinite(known)
+    expected, there = torch.zeros(count, 3, dtype=torch.float64), torch.isfinite(known)
     if there.any():
         factor = slope(pairs, known)
         expected[there, 0] = factor * (known[there] - known[there].mean()).double()

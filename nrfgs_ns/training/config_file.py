@@ -30,6 +30,7 @@ from nerfstudio.configs.base_config import PrintableConfig
 from nerfstudio.configs.experiment_config import ExperimentConfig
 from nerfstudio.engine.trainer import TrainerConfig
 
+from nrfgs_ns.compact.format import MAGIC
 from nrfgs_ns.errors import InputError
 
 
@@ -54,8 +55,10 @@ def read_config(path: Path) -> TrainerConfig:
     fix = "Name the config.yml that the training saved"
     if not path.is_file():
         raise InputError(f"{path}: no such file. {fix}.")
+    if (data := path.read_bytes()).startswith(MAGIC):
+        raise InputError(f"{path} is a compact file. Name {path}.nerfstudio/nrfgs/compact/config.yml instead.")
     try:
-        config = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
+        config = yaml.load(data.decode(), Loader=_Loader)
     except (yaml.YAMLError, RecursionError, ValueError, TypeError, LookupError, AttributeError) as error:
         raise InputError(f"{path} is not a configuration: {' '.join(str(error).split())}. {fix}.") from error
     if not isinstance(config, TrainerConfig):

@@ -235,8 +235,7 @@ def kernels_of(head: AppearanceHead) -> tuple[Callable[[torch.device], object], 
 
 def print_evaluation(result: Mapping[str, Any]) -> None:
     """Print the means over the test views, the worst view, and how to get LPIPS where it is missing."""
-    names = [name for name in SHOWN if result.get(name) is not None]
-    views = result["per_image"]
+    names, views = [name for name in SHOWN if result.get(name) is not None], result["per_image"]
     known = sorted((view["psnr"], view["image"]) for view in views if view.get("psnr") is not None)
     title = "One test view: not a mean, and no measure of the whole"
     CONSOLE.print(title if len(known) == 1 else f"Means over {len(known)} test views", soft_wrap=True)

@@ -107,8 +107,7 @@ class ProgressLine(LocalWriter):
             self._live = None
 
     def _update(self, step: int, is_last: bool = False) -> None:
-        start = perf_counter()
-        total = max(writer.GLOBAL_BUFFER["max_iter"], step + 1)
+        start, total = perf_counter(), max(writer.GLOBAL_BUFFER["max_iter"], step + 1)
         done = (step + 1) / total
         parts = [f"step {step + 1:,} of {total:,} ({100 * done:.0f} %)"]
         if self._pipeline is not None:

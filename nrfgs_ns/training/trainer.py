@@ -260,8 +260,7 @@ class NrfgsTrainer(Trainer):
 
     def _average(self, step: int) -> None:
         """Add the step's parameters to the mean if it is one of the last `average_steps` (see `averaging.window`)."""
-        mean = self.mean
-        timed = isinstance(self.pace, TimedPace)
+        mean, timed = self.mean, isinstance(self.pace, TimedPace)
         left = self.pace.steps_left if timed else self.last_step - step  # timed: an estimate
         size = window(self.config.average_steps, step + 1 + left)
         # A timed window stays once begun, unless the estimate was far off; otherwise the mean may be of steps that were

@@ -2,6 +2,7 @@
 """The trainer's options: checks before anything is read or written, automatic values, a training's folder."""
 
 import math
+import os
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import count
@@ -14,6 +15,7 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from nrfgs_ns.data.checks import shown
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.errors import DEBUG, InputError
 from nrfgs_ns.training import checkpoint_files
@@ -141,6 +143,8 @@ class NrfgsTrainerConfig(TrainerConfig):
         if data is None and parser.data == Path() and not is_here:
             fix = "Name the folder of the data set; `nrfgs prepare PHOTOS SCENE` makes one from photographs."
             raise InputError(f"--data is missing. {fix}")
+        if data is not None and not os.path.exists(data):
+            raise InputError(f"--data {shown(str(data))}: no such file or folder. Check the path.")
         if devices > 1:
             resolve_name(f"{SEVERAL_DEVICES}.launch:prepare")(self)
         CONSOLE.print(f"{self.method_name} on {data or _absolute(parser.data)}", **PLAIN)
@@ -194,6 +198,6 @@ def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool)
         CONSOLE.print(f"Images are read at {size}, {width} x {height} (--downscale-factor: docs/own-data.md).", **PLAIN)
     is_long = config.time_budget is None and config.max_num_iterations >= FEWEST_STEPS
     if config.machine.device_type == "cpu" and is_long and config.pipeline.datamanager.camera_res_scale_factor == 1:
-        scale = min(1.0, LONGEST_SIDE / max(width, height))
-        words = f"nrfgs-fast, --time-budget 10 and --pipeline.datamanager.camera-res-scale-factor {scale:.2g}"
+        scale, words = round(LONGEST_SIDE / max(width, height), 2), "nrfgs-fast with --time-budget 10"
+        words += f" --pipeline.datamanager.camera-res-scale-factor {scale:.2g}" * (scale < 1)
         CONSOLE.print(f"No CUDA device: the CPU trains. A result in ten minutes: {words}", **PLAIN)

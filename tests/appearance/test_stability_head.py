@@ -112,8 +112,7 @@ def test_a_splat_that_is_not_finite_harms_no_other(head, value, name):
     """Values of the others are to the bit what they are without it; gradients too, where the row is not asked for."""
     head, splats, center = build(head, Extreme())
     (own,) = splats.keys() & {"latents", "features_rest"}
-    others = torch.tensor([0, 1, 3, 4, 5])
-    expected = head(splats, torch.arange(6), center)
+    others, expected = torch.tensor([0, 1, 3, 4, 5]), head(splats, torch.arange(6), center)
     with torch.no_grad():
         splats[own if name == "the head's own" else name][2] = value
     got = head(splats, torch.arange(6), center)

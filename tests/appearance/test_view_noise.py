@@ -58,8 +58,7 @@ def test_noise_has_its_length_moves_nothing_else_and_is_the_steps_and_the_seeds_
     assert moved["latents"] is splats["latents"] and not splats["means"].any()
     assert (torch.autograd.grad(moved["means"].sum(), splats["means"])[0] == 1).all()
     assert moved_by(ViewNoise(0.0, 42), splats, 7) is splats
-    splats = {"means": torch.zeros(500, 3)}
-    noise = ViewNoise(1.0, 42)
+    splats, noise = {"means": torch.zeros(500, 3)}, ViewNoise(1.0, 42)
     state = torch.get_rng_state()
     first, second = moved_by(noise, splats, 0)["means"], moved_by(noise, splats, 1)["means"]
     assert torch.equal(torch.get_rng_state(), state), "another generator moved"

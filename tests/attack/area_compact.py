@@ -57,8 +57,7 @@ def replaced(name: str, stream: str, count: int, body, **entry) -> Case:
     """A stream with another body, and a header that says so."""
 
     def change(header: dict, bodies: list[bytes]) -> None:
-        content = body()
-        index = [one["name"] for one in header["streams"]].index(stream)
+        content, index = body(), [one["name"] for one in header["streams"]].index(stream)
         one = header["streams"][index]
         shape = [count] if len(one["shape"]) == 1 else [one["shape"][0], count // one["shape"][0]]
         one.update({"shape": shape, "bytes": len(content), "crc32": zlib.crc32(content), **entry})

@@ -30,6 +30,7 @@ from nrfgs_ns.compact.tables import NEAR, OCTAHEDRAL, STEPS, Grid, from_morton, 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Export
 from nrfgs_ns.trained.loading import load_file, load_model
+from nrfgs_ns.training.config_file import read_config
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -83,8 +84,7 @@ def test_every_number_comes_back_within_half_a_step(tmp_path):
     quats, scales = nearest_turn(truth["quats"].double().numpy(), truth["scales"].double().numpy())
     truth |= {"quats": torch.from_numpy(quats).float(), "scales": torch.from_numpy(scales).float()}
     # Half a step, and float32's rounding of numbers below 16: 2^-20.
-    rounding = 2.0**-20
-    median = one.splats["scales"].mean(dim=1).median().exp().item()
+    rounding, median = 2.0**-20, one.splats["scales"].mean(dim=1).median().exp().item()
     assert (read["means"] - truth["means"]).abs().max() <= STEPS["means"] * median / 2 + rounding
     assert (read["scales"] - truth["scales"]).abs().max() <= STEPS["scales"] / 2 + rounding
     cut = truth["opacities"].clamp(-LARGEST_LOGIT, LARGEST_LOGIT)
@@ -186,6 +186,17 @@ def test_nerfstudios_commands_read_the_file(exported, tmp_path):
     assert (spread.diff() < 1e-3).all() and spread[0] > 1.5 * spread[-1], "principal components, the strongest first"
     DatasetRender(load_config=config, output_path=tmp_path / "renders", image_format="png").main()
     assert len(list((tmp_path / "renders" / "test" / "rgb").rglob("*.png"))) == 2
+
+
+def test_the_files_config_is_read_from_any_folder(exported, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    compact(exported[0], Path("it.nrf"), "--no-measure")
+    config = tmp_path / "it.nrf.nerfstudio" / "nrfgs" / "compact" / "config.yml"
+    monkeypatch.chdir("/")
+    assert read_config(config).get_checkpoint_dir() == config.parent / "nerfstudio_models", "nerfstudio looks there"
+    load_model(config, "test")
+    with pytest.raises(InputError, match=f"is a compact file. Name {config}"):
+        load_model(tmp_path / "it.nrf", "test")
 
 
 def test_a_training_does_not_begin_with_a_compact_file(exported, tiny_scene, tmp_path):

@@ -143,8 +143,7 @@ def test_points_of_colmap_without_a_question(capture, monkeypatch, write, name, 
     if applied is not None:
         capture.meta["applied_transform"] = applied
     parser = capture.parser(data=capture.folder / "transforms.json" if as_file else capture.folder)
-    before = listing(capture.folder)
-    outputs = parser.get_dataparser_outputs("train")
+    before, outputs = listing(capture.folder), parser.get_dataparser_outputs("train")
     assert listing(capture.folder) == before
 
     assert_points_stay_in_front_of_cameras(capture, outputs, xyz)

@@ -90,8 +90,7 @@ def test_a_head_sees_the_same_in_any_unit(config, unit):
     head = config.setup()
     head.set_step(10**6)
     splats = {"means": torch.randn(20, 3), "opacities": torch.randn(20, 1), **head.splat_params(torch.rand(20, 3))}
-    center = splats["means"][0].clone()
-    rows = torch.arange(20)
+    center, rows = splats["means"][0].clone(), torch.arange(20)
     expected = head(splats, rows, center)
     head.scene_unit = unit
     found = head({**splats, "means": splats["means"] * unit}, rows, center * unit)

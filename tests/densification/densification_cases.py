@@ -73,8 +73,7 @@ class Table:
         """One training step; the splats in `seen` have the effective opacity `shown`, or what it makes of the stored
         ones, which it is given as heads compute them. `changed` are other entries of `info`."""
         info = self.info(gradient, absgrad) | changed
-        rows = info["gaussian_ids"][seen]
-        logits = self.splats["opacities"]
+        rows, logits = info["gaussian_ids"][seen], self.splats["opacities"]
         stored = torch.sigmoid(logits.detach().index_select(0, rows)).squeeze(-1)
         opacities = shown(stored) if callable(shown) else torch.as_tensor(shown).expand_as(stored)
         view = {**info, "gaussian_ids": rows, "radii": info["radii"][rows]}

@@ -94,8 +94,7 @@ def test_halves_keep_each_axis_variance_and_the_opacity(places):
     table.splats["scales"].data.copy_(torch.randn(6, 3) - 3)
     table.splats["quats"].data.copy_(torch.randn(6, 4))
     before = {name: value.detach().clone() for name, value in table.splats.items()}
-    held = dict(table.splats)
-    rows = torch.tensor([0, 2])
+    held, rows = dict(table.splats), torch.tensor([0, 2])
     split(table.splats, table.optimizers, rows, torch.tensor(places, dtype=torch.int64))
     table.check()
     assert len(table) == 8 - len(places)

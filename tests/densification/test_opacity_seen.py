@@ -36,8 +36,7 @@ def test_a_splat_visible_through_its_residual_only(name):
 @pytest.mark.parametrize("name", STRATEGIES)
 def test_a_splat_that_its_residual_hides(name):
     """Base above the threshold, invisible in all views: the peak sees it. What no view shows is judged by its base."""
-    table = Table(50)
-    rules = strategy(name, opacity_seen="peak")
+    table, rules = Table(50), strategy(name, opacity_seen="peak")
     torch.manual_seed(0)
     table.step(rules, REFINES, shown=0.001, seen=slice(0, 10))
     assert set(table.splats["latents"][:, 0].long().tolist()) == set(range(10, 50))
@@ -82,11 +81,9 @@ def test_a_head_of_stored_opacity_cannot_tell_peak_from_base(name):
 def test_heads_of_stored_opacity_change_nothing(config):
     """Exactly: 21 of 37 splats, so that they do not lie in the vectors and tails of a loop where the table has them."""
     torch.manual_seed(0)
-    head = config.setup()
-    logits = 3 * torch.randn(37, 1)
+    head, logits = config.setup(), 3 * torch.randn(37, 1)
     splats = {"means": torch.randn(37, 3), "opacities": logits, **head.splat_params(torch.rand(37, 3))}
-    rows = torch.randperm(37)[:21]
-    rules = strategy("mcmc")
+    rows, rules = torch.randperm(37)[:21], strategy("mcmc")
     info = {"gaussian_ids": rows, "radii": torch.ones(21)}
     rules.pre_backward(0, info, head(splats, rows, torch.zeros(3)).opacities, logits)
     rules.take_changes(info, 37)
@@ -157,8 +154,7 @@ def test_noise_spares_copies_as_their_source(shown):
 
 def test_what_views_have_shown_is_forgotten_after_the_last_relocation_too():
     """MCMC: noise goes on to the end of the training, and so must the windows of 100 steps that it looks back over."""
-    table = Table(50, opacity=0.001)
-    rules = strategy("mcmc", budget=50)
+    table, rules = Table(50, opacity=0.001), strategy("mcmc", budget=50)
     moved = {}
     for step in (25_050, 25_100, 25_101, 25_199, 25_200, 25_201, 25_300, 30_000):
         before = table.splats["means"].detach().clone()
@@ -194,8 +190,7 @@ def test_mean_opacity_in_the_loss_is_that_of_what_is_shown():
 
 def test_the_peak_is_forgotten_at_reset():
     """Splatfacto does not refine at a reset: what was seen before it must not keep a splat alive after it."""
-    table = Table(50)
-    rules = strategy("splatfacto", opacity_seen="peak")
+    table, rules = Table(50), strategy("splatfacto", opacity_seen="peak")
     table.step(rules, 2999, shown=0.9)
     assert_close(rules.state[CHANGE], torch.full((50,), 0.4))
     table.step(rules, 3000, shown=0.9)

@@ -53,8 +53,7 @@ def test_noise_has_the_splats_shape_and_spares_what_is_visible():
 
 # What happens to the rows.
 def test_relocated_splats_become_copies_of_live_ones():
-    table = Table(50)
-    dead = torch.zeros(50, dtype=torch.bool)
+    table, dead = Table(50), torch.zeros(50, dtype=torch.bool)
     dead[::5] = True
     before = {name: value.detach().clone() for name, value in table.splats.items()}
     torch.manual_seed(0)

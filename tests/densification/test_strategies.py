@@ -45,8 +45,7 @@ def test_every_tensor_of_the_table_goes_along(name):
 
 @pytest.mark.parametrize("budget", [30, 50, 57])
 def test_mcmc_grows_to_its_budget_and_stays_there(budget):
-    table = Table(50)
-    rules = strategy("mcmc", budget=budget)
+    table, rules = Table(50), strategy("mcmc", budget=budget)
     counts = []
     for step in range(600, 1300, 100):
         table.step(rules, step, gradient=1.0)
@@ -57,8 +56,7 @@ def test_mcmc_grows_to_its_budget_and_stays_there(budget):
 
 
 def test_mcmc_rests_before_its_start_and_after_its_end():
-    table = Table(50)
-    rules = strategy("mcmc")
+    table, rules = Table(50), strategy("mcmc")
     for step in (0, 500, 599, 25_000, 25_100):
         table.step(rules, step)
         assert len(table) == 50
@@ -95,8 +93,7 @@ def test_original_keeps_its_calendar():
         table.step(strategy("original"), step)
         assert len(table) == left
     # No reset before the first step (gsplat 1.4 has one); a reset to 0.01 at 3000, refinement right away after it.
-    table = Table(10, opacity=0.5)
-    rules = strategy("original", images=500)
+    table, rules = Table(10, opacity=0.5), strategy("original", images=500)
     table.step(rules, 0)
     assert_close(torch.sigmoid(table.splats["opacities"].detach()), torch.full((10, 1), 0.5))
     table.step(rules, 3000)

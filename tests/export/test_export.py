@@ -138,8 +138,7 @@ def test_a_head_that_is_harmonics_is_fitted_exactly(tiny_scene, tmp_path, monkey
 def test_a_ridge_counts_in_views():
     """Seen in one view only, a splat moves 16 / (4 pi) / (16 / (4 pi) + ridge) of the way, whatever its size."""
     bases = sh_bases(3, torch.nn.functional.normalize(torch.tensor([[0.3, -0.5, 0.8]]), dim=-1))
-    residual = torch.tensor([[0.1, -0.2, 0.05]])
-    power = 16 / (4 * math.pi)
+    residual, power = torch.tensor([[0.1, -0.2, 0.05]]), 16 / (4 * math.pi)
     for weight in (1e-3, 1e4):
         for views in (1, 3):
             moments = Moments(2, torch.device("cpu"))

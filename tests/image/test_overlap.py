@@ -137,8 +137,7 @@ def test_exif_is_a_start_as_far_as_photographs_agree_with_it():
 
 
 def test_exif_alone():
-    nothing = compare([], torch.zeros(0, 3))
-    known = torch.tensor([0.0, 1.0, UNKNOWN, 2.0])
+    nothing, known = compare([], torch.zeros(0, 3)), torch.tensor([0.0, 1.0, UNKNOWN, 2.0])
     assert spread(known) >= ENOUGH_KNOWN_STOPS > spread(torch.tensor([0.3, 0.4, UNKNOWN]))
     assert spread(torch.tensor([UNKNOWN])) == 0.0
     assert slope(nothing, known) == 1.0

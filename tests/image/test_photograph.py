@@ -23,8 +23,7 @@ def srgb(light):
 
 
 def test_starts_as_the_identity_to_the_bit():
-    image = torch.rand(6, 7, 3) * 1.2
-    model = model_of()
+    image, model = torch.rand(6, 7, 3) * 1.2, model_of()
     for index in range(5):
         assert torch.equal(model(image, index), image.clamp(0.0, 1.0))
 
@@ -73,8 +72,7 @@ def test_what_all_photographs_have_in_common_is_the_scenes():
 
 def test_patterns_that_are_the_scenes_stay_as_they_started():
     torch.manual_seed(0)
-    ramp = torch.linspace(-1.0, 1.0, 6)[:, None]
-    constant = torch.full((6, 1), 6**-0.5)
+    ramp, constant = torch.linspace(-1.0, 1.0, 6)[:, None], torch.full((6, 1), 6**-0.5)
     held = [torch.cat([constant, ramp / ramp.norm()], dim=1), constant, constant]
     start = torch.randn(6, 3)
     model = PhotographModel([str(index) for index in range(6)], start=start, held=held)

@@ -32,6 +32,8 @@ def test_the_command(tiny_scene, tmp_path, capsys, monkeypatch):
     assert "can be left out together" in capsys.readouterr().out
     with pytest.raises(InputError, match="0 of 2 test views"):
         tyro.cli(ablation.Inspect, args=["--load-config", str(config), "--views", "0"]).main()
+    with pytest.raises(InputError, match="--budget is nan"):
+        tyro.cli(ablation.Inspect, args=["--load-config", str(config), "--budget", "nan"]).main()
     monkeypatch.setattr("nrfgs_ns.model.model.NrfgsModel.mask_of", lambda *_: torch.zeros(36, 48, 1, dtype=torch.bool))
     with pytest.raises(InputError, match="12 of 0 test views inside masks"):
         tyro.cli(ablation.Inspect, args=["--load-config", str(config)]).main()

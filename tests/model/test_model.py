@@ -50,8 +50,7 @@ def test_crop_keeps_what_is_inside(build):
     pipeline = build()
     pipeline.eval()
     model, (camera, _) = pipeline.model, pipeline.datamanager.fixed_indices_eval_dataloader[0]
-    centre = model.means.detach().mean(dim=0)
-    size = model.means.detach().std(dim=0)
+    centre, size = model.means.detach().mean(dim=0), model.means.detach().std(dim=0)
     everything = OrientedBox.from_params(tuple(centre.tolist()), (0.0, 0.0, 0.0), (1e3, 1e3, 1e3))
     some = OrientedBox.from_params(tuple(centre.tolist()), (0.0, 0.0, 0.0), tuple(size.tolist()))
     nothing = OrientedBox.from_params((1e3, 1e3, 1e3), (0.0, 0.0, 0.0), (1e-3, 1e-3, 1e-3))
@@ -72,8 +71,7 @@ def test_crop_keeps_what_is_inside(build):
 def test_metrics_count_only_what_is_inside_the_mask(build):
     pipeline = build()
     model, (camera, batch) = pipeline.model.eval(), pipeline.datamanager.fixed_indices_eval_dataloader[0]
-    outputs = model.get_outputs_for_camera(camera)
-    truth = batch["image"].float() / 255
+    outputs, truth = model.get_outputs_for_camera(camera), batch["image"].float() / 255
     batch = {**batch, "image": batch["image"].clone(), "mask": torch.arange(48).expand(36, 48)[..., None] >= 16}
     batch["image"][:, :16] = 255
     metrics, _ = model.get_image_metrics_and_images(outputs, batch)
@@ -262,8 +260,7 @@ def test_the_image_of_features_is_drawn_over_the_background_and_then_exposed():
     splats, camera = table(torch.randn(6, 3)), turned_camera()
     view = project_view(splats, camera, ProjectionOptions())
     features = torch.rand(len(view.visible), 5)
-    appearance = SplatAppearance(features, torch.full((len(features),), 0.6))
-    seen = []
+    appearance, seen = SplatAppearance(features, torch.full((len(features),), 0.6)), []
 
     def image_of(composited, rays):
         seen.append((composited, rays))

@@ -89,8 +89,7 @@ def test_one_very_long_tile():
 
 def test_hidden_splats_cost_nothing(monkeypatch):
     """Behind an opaque wall of 20 layers, 5000 more splats are never looked at: one slab of 16 instead of 314."""
-    looked_at = []
-    batch = compositing.Batch
+    looked_at, batch = [], compositing.Batch
     monkeypatch.setattr(compositing, "Batch", lambda *a: looked_at.append(tuple(a[1].shape)) or batch(*a))
     n = 5020
     means, K = in_a_row(n)

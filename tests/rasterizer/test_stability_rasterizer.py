@@ -117,8 +117,7 @@ def test_coordinates_of_1e_6_and_1e6(coordinate):
 
     The near plane would cut the small one off: it is a length too, and is given in the same unit.
     """
-    reference = render(cloud())[0].detach()[..., :3]
-    splats = cloud()
+    reference, splats = render(cloud())[0].detach()[..., :3], cloud()
     for name in ("means", "scales"):
         splats[name] = (splats[name].detach() * coordinate).requires_grad_()
     image, _, _ = assert_healthy(splats, near_plane=0.01 * coordinate)
@@ -267,8 +266,7 @@ def test_indices_of_16_million_splats():
     """
     edge, side = tiles.SUB_TILE, 4096
     count = side * side
-    row = torch.arange(count) // side
-    column = torch.arange(count) % side
+    row, column = torch.arange(count) // side, torch.arange(count) % side
     centre = torch.stack([column, row]).double() * edge + edge / 2
     shape = torch.cat([centre, torch.tensor([[1.0], [0.0], [1.0], [-0.5]], dtype=torch.float64).expand(4, count)])
     spans = torch.stack([row, row + 1, column, column + 1])

@@ -31,10 +31,8 @@ def splats(count: int, width: int, height: int, seed: int = 0) -> Splats:
     turn = math.pi * torch.rand(count, generator=generator)
     cos, sin = turn.cos(), turn.sin()
     xx = (cos * long) ** 2 + (sin * short) ** 2 + 0.3
-    yy = (sin * long) ** 2 + (cos * short) ** 2 + 0.3
-    xy = cos * sin * (long**2 - short**2)
-    det = xx * yy - xy * xy
-    middle = 0.5 * (xx + yy)
+    yy, xy = (sin * long) ** 2 + (cos * short) ** 2 + 0.3, cos * sin * (long**2 - short**2)
+    det, middle = xx * yy - xy * xy, 0.5 * (xx + yy)
     radii = (3 * (middle + (middle**2 - det).clamp_min(0.1).sqrt()).sqrt()).ceil()
     seen = ((means2d + radii[:, None] > 0) & (means2d - radii[:, None] < size)).all(dim=1)
     opacities = torch.rand(count, generator=generator) ** 2

@@ -50,8 +50,7 @@ def test_steps_are_torchs(monkeypatch):
     torch.manual_seed(0)
     shapes = [(70, 3), (5,), (64,), (1,)]
     mine = [adam(shape, **options) for shape, options in zip(shapes, OPTIONS, strict=True)]
-    theirs = deepcopy(mine)
-    table = AdamTable(CPU)
+    theirs, table = deepcopy(mine), AdamTable(CPU)
     for turn in range(4):
         stepping = [i for i in range(4) if i != 1 or turn > 0]
         if turn == 2:

@@ -139,8 +139,7 @@ def test_another_failure_saves_too_and_is_raised(disk_is_full, tiny_scene, tmp_p
 
 def test_a_signal_in_the_last_step_finds_a_training_that_is_done(finished, tiny_scene, tmp_path, monkeypatch, capsys):
     """With the mean over the last steps, and without a viewer that would wait for another signal."""
-    trainer = ready(tiny_scene, tmp_path)
-    waited = []
+    trainer, waited = ready(tiny_scene, tmp_path), []
     monkeypatch.setattr("nerfstudio.engine.trainer.Trainer._train_complete_viewer", lambda _: waited.append(True))
     at_step(trainer, STEPS - 1, lambda: os.kill(os.getpid(), signal.SIGTERM))
     trainer.train()
@@ -238,12 +237,19 @@ def test_what_ns_train_says_before_it_begins(tiny_scene, tmp_path, monkeypatch, 
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match="--data is missing"):
         parse(["nrfgs"]).print_to_terminal()
+    with pytest.raises(InputError, match="typo: no such file or folder"):  # and no folder is made for it
+        parse(["nrfgs", "--data", "typo"]).print_to_terminal()
     monkeypatch.chdir(tiny_scene)
     for words in ([], ["nrfgs-data", "--data", str(tiny_scene)]):
         config = parse(["nrfgs", *words])
         capsys.readouterr()
         config.print_to_terminal()
         assert capsys.readouterr().out.splitlines() == [f"nrfgs on {tiny_scene}"]
+
+
+def test_on_a_cpu_smaller_images_are_advised_where_they_are_large(tiny_scene, tmp_path, capsys):
+    ready(tiny_scene, tmp_path, steps=10_000)
+    assert "in ten minutes: nrfgs-fast with --time-budget 10\n" in capsys.readouterr().out
 
 
 # Signals and states, without a training.

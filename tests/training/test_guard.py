@@ -81,8 +81,7 @@ def state_of(trainer) -> dict:
 def test_a_condemned_step_leaves_parameters_and_moments_as_they_were(start, fused, name, value):
     trainer = start(fused=fused)
     poison(trainer, at=3, name=name, value=value)
-    before = {}
-    original = trainer.guard.before_optimizers
+    before, original = {}, trainer.guard.before_optimizers
 
     def remember(*args):
         if trainer.step == 3:

@@ -17,8 +17,7 @@ from nrfgs_ns.training.pace import Pace
 def test_all_tensors_in_one_kernel_step_as_torchs():
     """Forty tensors, small and large, and a step that is skipped on the device. The twin is not fused: torch's fused
     Adam takes 1 - beta2^step in float32, 3e-5 off in the first steps."""
-    shapes = [(1000, 3), (300_000, 7), *[(size,) for size in range(1, 39)]]
-    sides = []
+    shapes, sides = [(1000, 3), (300_000, 7), *[(size,) for size in range(1, 39)]], []
     for fused in (True, False):
         torch.manual_seed(0)
         parameters = [torch.nn.Parameter(torch.randn(shape, device="cuda")) for shape in shapes]

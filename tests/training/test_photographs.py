@@ -49,8 +49,7 @@ def test_exposure_in_stops_of_exif_from_the_data_set_or_else_from_the_file(tmp_p
     assert exposure({**exif, "f_number": 2.0}) - exposure(exif) == pytest.approx(2.0)
     assert math.isnan(exposure({"f_number": 2.0, "iso": 100})) and math.isnan(exposure({}))
     assert exposures([exif, {}, exif, {"exposure_time": 0.01, "iso": 100}]).isnan().tolist() == [0, 1, 0, 1]
-    photo = tmp_path / "a.jpg"
-    exif = Image.Exif()
+    photo, exif = tmp_path / "a.jpg", Image.Exif()
     exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.ExposureTime] = 0.25
     Image.new("RGB", (8, 8)).save(photo, exif=exif)
     assert exif_of([photo, tmp_path / "b.jpg"], [{}, {"iso": 50}]) == [{"exposure_time": 0.25}, {"iso": 50}]

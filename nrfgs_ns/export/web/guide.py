@@ -76,8 +76,7 @@ def _tour_in(file: Path) -> dict[str, Any]:
         raise InputError(f"{file}: seconds is {seconds}; it must be positive.")
     loop = bool(content.get("is_cycle", False))
     views = views + views[:1] if loop else views
-    count = min(len(views), max(2, math.ceil(VIEWS_A_SECOND * seconds) + 1))
-    kept = []
+    count, kept = min(len(views), max(2, math.ceil(VIEWS_A_SECOND * seconds) + 1)), []
     for i in (round(k * (len(views) - 1) / (count - 1)) for k in range(count)):
         where, view = f"{file}: camera_path[{i}]", views[i] if isinstance(views[i], dict) else {}
         matrix = _numbers(view.get("camera_to_world"), 16, f"{where}.camera_to_world")

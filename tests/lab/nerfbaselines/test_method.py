@@ -64,8 +64,7 @@ def train(method: Nrfgs, first: int, last: int) -> None:
 
 def test_cameras_and_points_are_where_nerfstudio_has_them(tiny_scene):
     """The world of all images is that of the parser that `ns-train` uses; cameras and points in it are the same."""
-    given = read(tiny_scene)
-    config = NrfgsDataParserConfig(data=tiny_scene)
+    given, config = read(tiny_scene), NrfgsDataParserConfig(data=tiny_scene)
     world = World.around(given["cameras"].poses, config)
     train = config.setup().get_dataparser_outputs("train")
     cameras = world.cameras(read(tiny_scene, "train")["cameras"])
