@@ -7,7 +7,7 @@ command that runs is imported; the list reads the others' docstrings from their 
 
 import ast
 import difflib
-import os
+import errno
 import sys
 import warnings
 from importlib.metadata import EntryPoint, entry_points
@@ -16,9 +16,9 @@ from importlib.util import find_spec
 import tyro
 
 from nrfgs_ns.errors import DEBUG, InputError
-from nrfgs_ns.files import NO_ROOM
 
 GROUP = "nrfgs.commands"
+NO_ROOM = errno.ENOSPC, errno.EDQUOT, errno.EFBIG  # a full disk, a quota, a limit on the size of files
 
 
 def commands() -> dict[str, EntryPoint]:
@@ -66,9 +66,6 @@ def entrypoint() -> None:
     warnings.filterwarnings("ignore", "Converting a tensor with requires_grad=True to a scalar")
     try:
         chosen(sys.argv[1:]).main()
-    except BrokenPipeError:  # as of `nrfgs doctor | head -1`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python writes the rest when it ends
-        sys.exit(141)
     except (InputError, OSError) as error:
         no_room = getattr(error, "errno", None) in NO_ROOM
         if DEBUG or not (no_room or isinstance(error, (InputError, FileExistsError))):

@@ -2,7 +2,6 @@
 """Files that are complete or absent."""
 
 import contextlib
-import errno
 import os
 import secrets
 import tempfile
@@ -10,9 +9,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from nrfgs_ns.errors import InputError
-
-NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""What the system says of a full disk, a quota, and a limit on the size of files"""
 
 
 def check_writable(path: Path, option: str) -> None:
@@ -42,9 +38,5 @@ def whole(path: Path) -> Iterator[Path]:
     try:
         yield aside
         os.replace(aside, path)
-    except OSError as error:  # of a full disk the system does not say which file was written
-        if error.errno in NO_ROOM:
-            error.filename = str(path)
-        raise
     finally:
         aside.unlink(missing_ok=True)

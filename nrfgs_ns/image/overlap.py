@@ -247,8 +247,7 @@ def _constant(count: int) -> Tensor:
 def _places(centers: Tensor) -> list[tuple[Tensor, Tensor]]:
     """Covariance of g at each scale, of variance 1 and mean 0: eigenvalues [V], falling, and eigenvectors [V, V]."""
     distance = torch.cdist(centers.double(), centers.double())
-    spacing = distance.sort(dim=1).values[:, 1 : 1 + NEIGHBOURS].mean().clamp_min(1e-12)
-    bases = []
+    spacing, bases = distance.sort(dim=1).values[:, 1 : 1 + NEIGHBOURS].mean().clamp_min(1e-12), []
     for scale in SCALES:
         covariance = torch.exp(-distance / (scale * spacing))
         covariance = covariance - covariance.mean(dim=0) - covariance.mean(dim=1, keepdim=True) + covariance.mean()
@@ -260,8 +259,7 @@ def _places(centers: Tensor) -> list[tuple[Tensor, Tensor]]:
 def _split(places: list[tuple[Tensor, Tensor]], precision: Tensor, seen: Tensor) -> tuple[float, Tensor, Tensor]:
     """Variance of s, covariance of d, patterns of g; likeliest brightness: precision [V, V] @ d = seen [V]."""
     count = len(seen)
-    eye = torch.eye(count, dtype=torch.float64)
-    own_precision = precision.diagonal().clamp_min(1e-9)
+    eye, own_precision = torch.eye(count, dtype=torch.float64), precision.diagonal().clamp_min(1e-9)
     brightness = torch.linalg.solve(precision + 1e-6 * own_precision.mean() * eye, seen)
     noise = float((1.0 / own_precision).median())
     best, highest = None, -math.inf

@@ -56,7 +56,7 @@ def read_config(path: Path) -> TrainerConfig:
     if not path.is_file():
         raise InputError(f"{path}: no such file. {fix}.")
     if (data := path.read_bytes()).startswith(MAGIC):
-        raise InputError(f"{path} is a compact file. Name {path}.nerfstudio/nrfgs/compact/config.yml instead.")
+        raise InputError(f"{path} is a compact file. Name the config.yml in {path}.nerfstudio instead.")
     try:
         config = yaml.load(data.decode(), Loader=_Loader)
     except (yaml.YAMLError, RecursionError, ValueError, TypeError, LookupError, AttributeError) as error:

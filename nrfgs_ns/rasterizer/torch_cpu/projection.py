@@ -105,8 +105,7 @@ def _to_screen(
     unit = directions(quats)
     rotations = rotation_matrices(unit)
     right, down, forward = _rotate(W, rotations * scales.t())
-    a0 = (fx / pz) * (right - u * forward)
-    a1 = (fy / pz) * (down - v * forward)
+    a0, a1 = (fx / pz) * (right - u * forward), (fy / pz) * (down - v * forward)
 
     xx, xy, yy = (a0 * a0).sum(0), (a0 * a1).sum(0), (a1 * a1).sum(0)
     normal = torch.linalg.cross(a0, a1, dim=0)

@@ -116,8 +116,7 @@ def footprints(projection: Projection, opacities: Tensor) -> Footprints:
     log_opacity = opacities.index_select(0, order).double().log()
     shape = torch.stack([x.double(), y.double(), a, b, c, log_opacity])
 
-    det = a * c - b * b
-    reach = 2 * (log_opacity - math.log(MIN_ALPHA) + REACH_SLACK)
+    det, reach = a * c - b * b, 2 * (log_opacity - math.log(MIN_ALPHA) + REACH_SLACK)
     half_x, half_y = (reach * c / det).sqrt(), (reach * a / det).sqrt()
     col0, col1 = _inclusive_range(shape[0] - half_x, shape[0] + half_x)
     row0, row1 = _inclusive_range(shape[1] - half_y, shape[1] + half_y)
@@ -175,8 +174,7 @@ def list_tiles(prints: Footprints, block: Block) -> TileLists:
     # The columns that the ellipse covers on the pixel rows [y0, y1]: on the line dy, dx = slope dy -+ sqrt(widest -
     # narrowing dy^2).
     x, y, a, b, c, log_opacity = prints.shape
-    det = a * c - b * b
-    reach = 2 * (log_opacity - math.log(MIN_ALPHA) + REACH_SLACK)
+    det, reach = a * c - b * b, 2 * (log_opacity - math.log(MIN_ALPHA) + REACH_SLACK)
     rightmost = -(b / c) * (reach * c / det).sqrt()
     ellipse = torch.stack([x, y, rightmost, -b / a, reach / a, det / (a * a)])
     x, y, rightmost, slope, widest, narrowing = (column.index_select(0, splat) for column in ellipse)
