@@ -130,7 +130,7 @@ nrfgs_sh = method(
 
 nrfgs_harmonics = preset(
     "nrfgs-harmonics",
-    method("nrfgs-harmonics", ShConfig(), "", features_rest=adam(0.0025 / 20)),
+    nrfgs_sh,
     "nrfgs with spherical harmonics instead of the field: for few photographs (docs/captures.md).",
     model=SUITED,
     max_num_iterations=0,

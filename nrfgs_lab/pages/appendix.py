@@ -12,9 +12,9 @@ from nrfgs_lab.pages.speed import RENDERERS, scale_cells
 
 RIVALS = {"3DGS's": ORIGINAL, "splatfacto's": "splatfacto", "MCMC's, 150,000 splats": "mcmc@150000_refine_every_50"}
 """Label -> strategy in results/default.json."""
-HEADS = "linear basis", "field without opacity residual", "linear basis with opacity residual", "field"
+BETWEEN = "linear basis", "field without opacity residual", "linear basis with opacity residual", "field"
 RATES = {"harmonics, 4 times the rate": "4 times the rate", "16 times, decaying": "16 times the rate, decaying to one"}
-HEADS = RATES | dict(zip(HEADS, HEADS, strict=True))
+HEADS = RATES | {name: name for name in BETWEEN}
 """Label -> trial of rates in results/trials.json; its default are harmonics."""
 GAPS = {"**twice the residual, on the logit**: `nrfgs`": "twice on the logit", "harmonics without noise": "harmonics"}
 """Label -> trial with gaps in results/trials.json; its default added the residual to the opacity."""

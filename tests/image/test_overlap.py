@@ -2,7 +2,6 @@
 """Photographs of known exposure of a painted wall, from places next to each other."""
 
 import math
-from time import perf_counter
 
 import pytest
 import torch
@@ -107,12 +106,15 @@ def test_of_a_large_capture_a_part_says_how_photographs_differ(monkeypatch):
     assert not any(enough(looks_of(torch.zeros(24, 3))))
 
 
-def test_thousands_of_photographs_take_a_moment():
+def test_thousands_of_photographs_need_no_dense_system(monkeypatch):
+    sizes, solve = [0], torch.linalg.solve  # whose cost grows with the cube of the size
+    monkeypatch.setattr(torch.linalg, "solve", lambda a, b: sizes.append(len(a)) or solve(a, b))
+    torch.manual_seed(3)
     stops, first = torch.randn(5000, 3) * 0.3, torch.arange(10_000) % 5000
     second = (first + 1 + torch.arange(10_000) // 5000) % 5000
-    pairs, begin = Pairs(first, second, stops[second] - stops[first], torch.full((10_000, 3), 0.02)), perf_counter()
+    pairs = Pairs(first, second, stops[second] - stops[first], torch.full((10_000, 3), 0.02))
     looks = estimate(pairs, torch.full((5000,), UNKNOWN), places(5000))
-    assert perf_counter() - begin < 20 and (looks.stops - stops + stops.mean(dim=0)).abs().max() < 0.2
+    assert max(sizes) <= overlap.MOST_PHOTOGRAPHS and (looks.stops - stops + stops.mean(dim=0)).abs().max() < 0.2
 
 
 def test_hidden_points_and_dark_or_bright_pixels_are_left_out():
