@@ -27,9 +27,10 @@ APPEARANCE = "pipeline.model.appearance."
 
 INTRODUCTION = """# Options
 
-**These options, with `nrfgs`'s defaults, are this package's own; `ns-train METHOD --help` lists all.** `nrfgs-sh`,
-`nrfgs-vdgs`, `nrfgs-gsnb` and `nrfgs-sg` have `view-noise`, `few-views`, `shrinkage`, `dense-start` and `near-plane`
-off, splatfacto's densification, and 30,000 steps without averaging. Cameras lie within [-1, 1] scene units.
+**This page explains the options that this package adds, with `nrfgs`'s defaults. `ns-train METHOD --help` lists all.**
+`nrfgs-sh`, `nrfgs-vdgs`, `nrfgs-gsnb` and `nrfgs-sg` turn off `view-noise`, `few-views`, `shrinkage`, `dense-start` and
+`near-plane`, and have splatfacto's densification and 30,000 steps without averaging. Cameras lie within [-1, 1] scene
+units.
 """
 SPLATFACTOS = {field.name for field in dataclasses.fields(SplatfactoModelConfig)}
 """Options of splatfacto's model, not explained here."""
@@ -117,9 +118,8 @@ def page() -> str:
         "## Training and data\n\n`nrfgs-data` and what follows it come last in a command.\n",
         listed([option for option in rest if ".dataparser." not in option.flag] + data),
         HOST,
-        "## Methods\n",
-        *(f"- `{one.config.method_name}`: {linked(one.description)}" for one in others),
-        "\n`nrfgs --help` lists the other commands.",
+        f"`ns-train --help` explains the other methods: {', '.join(f'`{one.config.method_name}`' for one in others)}.",
+        "`nrfgs --help` lists the other commands.",
     ]
     return "\n".join(parts) + "\n"
 
