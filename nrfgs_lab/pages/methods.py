@@ -172,11 +172,6 @@ def rates(head: str) -> str:
     return ", ".join(f"{setting} {signed(won, 2)}" for won, setting in best.values() if setting)
 
 
-def wider() -> str:
-    """Most that a setting beyond the chosen ones gains, of the network and of the convolutions: of a higher rate."""
-    return " and ".join(signed(max(setting_gains(f"wide-{head}").values()), 2) for head in ("deferred", "latent-spec"))
-
-
 def seats() -> str:
     """Networks at the splat and at the pixel: PSNR/SSIM of each capture, and mean MS-SSIM and FLIP."""
     body = []
@@ -245,6 +240,6 @@ def noise() -> str:
 
 BLOCKS = {
     **{f"comparison.{block.__name__}": block for block in (every, parts, over_gsnb, chosen)},
-    **{f"equal.{block.__name__}": block for block in (at_equal_numbers, over, rates, wider, first_rule, seats)},
+    **{f"equal.{block.__name__}": block for block in (at_equal_numbers, over, rates, first_rule, seats)},
     **{f"deviations.{block.__name__}": block for block in (worth, noise)},
 }
