@@ -48,7 +48,8 @@ def failed_views(pipeline) -> dict[str, dict[str, float]]:
     """PSNR of each test view without each kind of suspects, in dB: image name -> what is left out -> PSNR."""
     model, data = pipeline.model, pipeline.datamanager
     shown, inside, framed, least = seen_in_training(pipeline)
-    points, result = (model.seed_points or [model.means[:0]])[0].to(model.device), {}
+    points = (model.seed_points or [model.means[:0]])[0].to(model.device)
+    result = {}
     close = least < BESIDE * nearest_depth(points, data.train_dataset.cameras.to(model.device))
     suspects = {"shown by 1": shown <= 1, "in 1 image": inside <= 1, "beside": close & (framed < 0.5)}
     pairs = zip(data.eval_dataset.image_filenames, data.fixed_indices_eval_dataloader, strict=True)

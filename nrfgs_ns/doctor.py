@@ -75,8 +75,8 @@ def machine() -> list[Finding]:
         need = "its driver" if torch.version.cuda else "a build of PyTorch for CUDA"
         fix = f"Training runs on the CPU, slowly; to use an NVIDIA GPU install {need}."
         return [*findings, Finding("GPU", f"none; {build}", fix)]
-    name, (free, total) = torch.cuda.get_device_name(), (size / 1e9 for size in torch.cuda.mem_get_info())
-    gpu = Finding("GPU", f"{name}, {free:.1f} of {total:.1f} GB free; {build}")
+    free, total = (size / 1e9 for size in torch.cuda.mem_get_info())
+    gpu = Finding("GPU", f"{torch.cuda.get_device_name()}, {free:.1f} of {total:.1f} GB free; {build}")
     return [*findings, gpu, *kernels(torch.device("cuda", torch.cuda.current_device()))]
 
 

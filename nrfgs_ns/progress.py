@@ -21,7 +21,8 @@ def progress(description: str, total: int | None = None) -> Iterator[Callable[..
             task = bar.add_task(description, total=total)
             yield lambda description=None: bar.update(task, advance=1, description=description)
         return
-    done, printed = 0, monotonic()
+    done = 0
+    printed = monotonic()
     CONSOLE.print(f"{description} ...", markup=False, highlight=False, soft_wrap=True)
 
     def advance(detail: str | None = None) -> None:

@@ -61,7 +61,8 @@ def _compile_when_called(torch_compile: Callable) -> Callable:
 def _names_of_callers() -> list[SimpleNamespace]:
     """Names of the running functions, the caller's first. Nerfstudio calls inspect.stack() 26 times, which reads the
     source of every frame: two fifths of a command's start."""
-    frame, frames = sys._getframe(1), []
+    frame = sys._getframe(1)
+    frames = []
     while frame is not None:
         frames.append(SimpleNamespace(function=frame.f_code.co_name))
         frame = frame.f_back

@@ -161,7 +161,8 @@ class Run:
         self.stage("pairs", "choose pairs", [self.pairs_file], len(names), choose, matching=matching)
 
     def match(self) -> None:
-        names, chosen = self.names, [tuple(pair) for pair in json.loads(self.pairs_file.read_text())]
+        names = self.names
+        chosen = [tuple(pair) for pair in json.loads(self.pairs_file.read_text())]
 
         def match(advance: Advance) -> None:
             if structure.match_features(self.database, names, chosen, self.work, advance) == 0:
@@ -230,7 +231,8 @@ class Run:
     def verdict(self) -> None:
         """Print results and the next step, and write the numbers to OUT/prepare.json."""
         model = structure.colmap().Reconstruction(self.model)
-        total, registered = len(self.names), model.num_reg_images()
+        total = len(self.names)
+        registered = model.num_reg_images()
         numbers = {
             "photographs": total,
             "registered": registered,

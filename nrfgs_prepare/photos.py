@@ -135,7 +135,8 @@ def _store(image: Image.Image, path: Path, target: Path) -> None:
 
 def exif_of_copy(exif: Image.Exif) -> bytes:
     """The camera, exposure, date and position of a turned copy, for PIL's `exif` option."""
-    copy, details = Image.Exif(), exif.get_ifd(ExifTags.IFD.Exif)
+    copy = Image.Exif()
+    details = exif.get_ifd(ExifTags.IFD.Exif)
     copy.update({tag: exif[tag] for tag in KEPT_TAGS if tag in exif})
     copy.get_ifd(ExifTags.IFD.Exif).update({tag: details[tag] for tag in KEPT_DETAILS if tag in details})
     copy.get_ifd(ExifTags.IFD.GPSInfo).update(exif.get_ifd(ExifTags.IFD.GPSInfo))
@@ -159,7 +160,8 @@ def import_video(video: Path, folder: Path, frames: int, advance: Advance) -> No
 
     reader = cv2.VideoCapture(str(video))
     total = int(reader.get(cv2.CAP_PROP_FRAME_COUNT))
-    frames, written = min(frames, total), 0
+    frames = min(frames, total)
+    written = 0
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
 

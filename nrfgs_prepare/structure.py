@@ -110,7 +110,8 @@ def _scale_focal_lengths(database: Path, photos: Path, names: list[str]) -> None
             raise InputError(f"{photos / unread[0]} is left out by COLMAP. Save it anew as JPEG or PNG, or remove it.")
         cameras = {image.camera_id: name for name, image in images.items()}
         for number, name in cameras.items():
-            camera, share = opened.read_camera(number), share_of_size(photos / name)
+            camera = opened.read_camera(number)
+            share = share_of_size(photos / name)
             if camera.has_prior_focal_length and share != 1.0:
                 params = camera.params
                 params[camera.focal_length_idxs()] *= share
@@ -153,8 +154,9 @@ def positions(database: Path, names: list[str]) -> np.ndarray:
 def match_features(database: Path, names: list[str], pairs: Pairs, folder: Path, advance: Advance) -> int:
     """Match and verify pairs of photographs, and return the number of verified ones."""
     pycolmap = colmap()
-    listed, verification = folder / "pairs.txt", pycolmap.TwoViewGeometryOptions()
+    listed = folder / "pairs.txt"
     pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
+    verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
     for first in range(0, len(pairs), PAIRS_AT_ONCE):
         part = pairs[first : first + PAIRS_AT_ONCE]

@@ -23,7 +23,7 @@ def test_every_contract_is_kept(capsys, monkeypatch):
 @pytest.mark.parametrize("place", host.PRIVATE)
 def test_no_private_name_is_lost(place):
     owner = resolve_name(place)
-    lost = [name for name in host.PRIVATE[place] if not hasattr(owner, name)]
+    lost = [name for name in host.PRIVATE[place].split() if not hasattr(owner, name)]
     assert [name for name in lost if f"self.{name}" not in getsource(owner)] == []
 
 

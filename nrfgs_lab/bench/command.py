@@ -118,7 +118,8 @@ class Bench:
         given = {"steps": self.steps, "options": self.options, "jobs": self.jobs, "gpus": self.gpus}
         content = load_spec(self.spec, self.plan)
         content |= {key: value for key, value in given.items() if value is not None}
-        data, listed = [scene_path(name) for name in self.data], as_list(content.get("scenes", []))
+        data = [scene_path(name) for name in self.data]
+        listed = as_list(content.get("scenes", []))
         content["scenes"] = listed + [name for name in data if name not in map(scene_path, listed)]
         seeds = as_list(content.get("seeds", 42))
         content["seeds"] = seeds + [seed for seed in self.seeds if seed not in seeds]
@@ -185,7 +186,8 @@ class Bench:
         """Run the jobs, `plan.jobs` at once on each GPU, with the time that is left."""
         for folder in (self.out / "runs", self.work):
             folder.mkdir(parents=True, exist_ok=True)
-        waiting, running, finished = list(pending.items()), {}, 0
+        waiting, running = list(pending.items()), {}
+        finished = 0
         slots = [gpu for _ in range(plan.jobs) for gpu in gpu_names(plan.gpus)]
         # A training on a GPU needs few CPU threads, but torch takes all cores: side by side they wait for each other.
         threads = max(1, (os.cpu_count() or 1) // len(slots))

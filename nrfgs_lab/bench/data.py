@@ -39,7 +39,8 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
     Mirrored and held-out data sets are written below `mirrors`. InputError if the folder has neither layout, or the
     downscaled images are missing.
     """
-    folder, mirror = root / scene.path, mirrors / scene.name.replace("/", ", ")  # a folder in a mirror may be a link
+    folder = root / scene.path
+    mirror = mirrors / scene.name.replace("/", ", ")  # a folder in a mirror may be a link
     scale = [] if scene.downscale is None else ["--downscale-factor", str(scene.downscale)]
     if scene.held_out is not None or scene.views is not None:
         with FileLock(mirror.with_name(f"{mirror.name}.lock")):
@@ -58,10 +59,7 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
         return ["nrfgs-data", "--data", str(folder), *split, *scale, *scene.options]
     model = find_colmap(folder)
     if model is None:
-        raise InputError(
-            f"{folder} has neither transforms.json nor a COLMAP model (sparse/0 or colmap/sparse/0). Name a folder "
-            "that has one below --scenes."
-        )
+        raise InputError(f"{folder} has neither transforms.json nor a COLMAP model. Name a folder that has one.")
     smaller = folder / f"images_{scene.downscale}"
     if scene.downscale and not smaller.is_dir():
         raise InputError(f"{smaller} is missing. Downscale the images into it, or choose a factor that is there.")
@@ -72,7 +70,8 @@ def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
 
 def mirrors_already(mirror: Path, folder: Path) -> bool:
     """Whether there is a whole mirror of this folder and its transforms.json; any other, or part of one, is removed."""
-    note, file = mirror / "mirror-of", folder / "transforms.json"
+    note = mirror / "mirror-of"
+    file = folder / "transforms.json"
     here = f"{folder.resolve()}, {file.stat().st_mtime_ns if file.is_file() else 0}"
     whole_one = note.is_file() and note.read_text(encoding="utf-8") == here and (mirror / "transforms.json").exists()
     if not whole_one:
@@ -99,7 +98,8 @@ def by_place(names: list[str], frames: list[dict]) -> list[str]:
 def select_views(folder: Path, out: Path, scene: Scene) -> None:
     """Write a data set of a capture's training views at half the size, some of them held out, or of the whole capture
     with fewer training views, into `out`. InputError if the capture names no training views."""
-    file, meta = folder / "transforms.json", transforms_of(folder)
+    file = folder / "transforms.json"
+    meta = transforms_of(folder)
     if not meta.get("train_filenames"):
         raise InputError(f"{file} is missing, or names no train_filenames. Give a capture that nrfgs prepare wrote.")
     names = sorted(meta["train_filenames"])

@@ -159,10 +159,8 @@ def _checked(value: dict[str, Any], kind: type, where: str) -> dict[str, Any]:
         least = LEASTS[key]
         for number in as_list(value[key]) if key in LISTS else [value[key]]:
             is_whole = isinstance(number, int) and not isinstance(number, bool) and number >= least
-            is_left_open = number is known[key] is None or (kind is Method and number == OWN)
-            _require(
-                is_whole or is_left_open, f"{where}: {key} is {number!r}; give a whole number of at least {least}."
-            )
+            is_open = number is known[key] is None or (kind is Method and number == OWN)
+            _require(is_whole or is_open, f"{where}: {key} is {number!r}; give a whole number of at least {least}.")
     return {**value, "options": words_of(value.get("options", ()), f"{where}: options")}
 
 

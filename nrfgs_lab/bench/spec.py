@@ -88,8 +88,7 @@ class Cell:
     @property
     def name(self) -> str:
         """Name of its files."""
-        text = f"{self.run.name}-{self.strategy}-{self.scene.name}-{self.seed}"
-        return re.sub(r"[^A-Za-z0-9_.@-]", "_", text)
+        return re.sub(r"[^A-Za-z0-9_.@-]", "_", f"{self.run.name}-{self.strategy}-{self.scene.name}-{self.seed}")
 
 
 def cells_of(spec: Spec) -> list[Cell]:

@@ -134,7 +134,8 @@ def average(rows: list[Row]) -> Row:
 
 def with_averages(rows: list[Row]) -> list[Row]:
     """Rows, followed by an average for each run and strategy that has all scenes, if there are several."""
-    kinds, scenes = dict.fromkeys((row.strategy, row.run) for row in rows), {row.scene for row in rows}
+    kinds = dict.fromkeys((row.strategy, row.run) for row in rows)
+    scenes = {row.scene for row in rows}
     of_kinds = [[row for row in rows if (row.strategy, row.run) == kind] for kind in kinds]
     return rows + [average(of_kind) for of_kind in of_kinds if len(of_kind) == len(scenes) > 1]
 
@@ -170,9 +171,7 @@ def notes(rows: list[Row]) -> list[str]:
     if any(record["train"].get("parts", 1) > 1 for record in records):
         result.append("Some runs were interrupted and went on from a checkpoint; their times are sums.")
     if any(row.absent for row in rows):
-        result.append(
-            "Runs that failed, are missing or were made with other arguments (stale) are counted under seeds."
-        )
+        result.append("Runs that failed, are missing or had other arguments (stale) are counted under seeds.")
     thin = [one.name for one in COLUMNS if any(0 < len(row.values[one.name]) < len(row.records) for row in rows)]
     if thin:
         result.append(f"Some numbers rest on fewer seeds than their row, on those that have them: {', '.join(thin)}.")
@@ -195,15 +194,15 @@ def notes(rows: list[Row]) -> list[str]:
 
 def markdown(rows: list[Row]) -> str:
     """Markdown table: best of each scene and strategy bold, second in italics."""
-    body, mark = [], {1: "**{}**", 2: "_{}_"}
+    body = []
+    mark = {1: "**{}**", 2: "_{}_"}
     for place in dict.fromkeys((row.scene, row.strategy) for row in rows):
         group = [row for row in rows if (row.scene, row.strategy) == place]
         ranked = {column.name: ranks(group, column) for column in COLUMNS}
         for number, row in enumerate(group):
             cells = [mark.get(ranked[one.name].get(number), "{}").format(row.text(one)) for one in COLUMNS]
             body.append([*map(plain_markdown, [row.scene, row.run, row.strategy, row.seeds]), *cells])
-    table = grid(HEAD + [column.name for column in COLUMNS], body, len(HEAD))
-    return "\n\n".join([table, *notes(rows)]) + "\n"
+    return "\n\n".join([grid(HEAD + [column.name for column in COLUMNS], body, len(HEAD)), *notes(rows)]) + "\n"
 
 
 def grid(head: Sequence[str], rows: Iterable[Sequence[str]], left: int | None = None) -> str:

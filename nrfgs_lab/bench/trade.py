@@ -79,7 +79,8 @@ def changes(rows: Sequence[Row], default: Row, column: Column, ratio: bool) -> d
     if ratio:
         samples = {run: [math.log(value) for value in values if value > 0] for run, values in samples.items()}
     deviation, freedom = pooled_deviation(list(samples.values()))
-    base, result = samples[default.run], {}
+    base = samples[default.run]
+    result = {}
     for name, sample in samples.items():
         if not sample or not base:
             continue
@@ -146,7 +147,8 @@ def table(rows: list[Row], default: Row) -> str:
     lines = []
     for row in rows:
         if row is default:
-            cells, prices = [row.text(BY_NAME[name]) for name in SHOWN], [""] * len(COSTS)
+            cells = [row.text(BY_NAME[name]) for name in SHOWN]
+            prices = [""] * len(COSTS)
         else:
             cells = [change_text(changed[name].get(row.run), name) for name in SHOWN]
             gain = changed["PSNR"].get(row.run)

@@ -213,8 +213,7 @@ def configure(method: str, overrides: dict[str, Any], metadata: dict[str, Any]) 
             raise InputError(f"The data set's background is {np.asarray(color)}; only black and white are known.")
         words = ["--pipeline.model.background_color", name]
     for name, value in overrides.items():
-        values = value if isinstance(value, (list, tuple)) else [value]
-        words += [f"--{name}", *map(str, values)]
+        words += [f"--{name}", *map(str, value if isinstance(value, (list, tuple)) else [value])]
     config = parse([method, *words])
     resized = config.pipeline.datamanager.camera_res_scale_factor != 1.0
     if config.time_budget is not None or config.machine.num_devices > 1 or resized:

@@ -34,7 +34,4 @@ def losses() -> str:
     return grid(["", "splats", "MB", "seconds", "model", "file", "in Spark", "harmonics, trained"], body)
 
 
-BLOCKS = {
-    "export.losses": losses,
-    "export.worst": lambda: f"{max(one['loss_db'] for one in plies().values()):.1f}",
-}
+BLOCKS = {"export.losses": losses, "export.worst": lambda: f"{max(one['loss_db'] for one in plies().values()):.1f}"}

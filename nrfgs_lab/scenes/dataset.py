@@ -45,10 +45,7 @@ def write_scene(config: SceneConfig, out: Path, advance: Callable[[], object] = 
         with contextlib.suppress(OSError, ValueError):
             if json.loads((out / "scene.json").read_text(encoding="utf-8")) == record:
                 return out
-        raise FileExistsError(
-            f"{out} exists and is not this procedural scene. Choose another folder, or delete this one to have it "
-            "written again."
-        )
+        raise FileExistsError(f"{out} exists and is not this procedural scene. Choose another, or delete this one.")
 
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as workshop:
@@ -106,12 +103,10 @@ def _write_files(scene: Scene, folder: Path, advance: Callable[[], object]) -> N
     names = sorted(train + test)
     (folder / "images").mkdir(parents=True)
     for name, camera in zip(names, cameras, strict=True):
-        values = np.round(255.0 * render(scene, camera)).astype(np.uint8)
-        Image.fromarray(values).save(folder / name)
+        Image.fromarray(np.round(255.0 * render(scene, camera)).astype(np.uint8)).save(folder / name)
         advance()
 
-    is_train = np.isin(names, train)
-    points, colours = sparse_points(scene, cameras[is_train])
+    points, colours = sparse_points(scene, cameras[np.isin(names, train)])
     write_ply(folder / "sparse.ply", points, np.round(255.0 * colours).astype(np.uint8))
     lens = {"w": config.width, "h": config.height, **dict.fromkeys(("fl_x", "fl_y"), config.focal_length)}
     lens |= {"cx": 0.5 * config.width, "cy": 0.5 * config.height, **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)}

@@ -77,11 +77,11 @@ class Box:
 
     @property
     def ball_radius(self) -> float:
-        volume = 8.0 * float(np.prod(self.half_sides))
-        return (0.75 * volume / np.pi) ** (1.0 / 3.0)
+        return (0.75 * (8.0 * float(np.prod(self.half_sides))) / np.pi) ** (1.0 / 3.0)
 
     def interval(self, origins: Array, directions: Array) -> tuple[Array, Array]:
-        o, d = self.local(origins), self._turn(directions, -self.yaw) / column(self.half_sides, directions.dtype)
+        o = self.local(origins)
+        d = self._turn(directions, -self.yaw) / column(self.half_sides, directions.dtype)
         # In its own frame the box is the cube [-1, 1]^3, the meeting of three slabs. An axis along which the ray does
         # not move gets a tiny speed instead of a division by zero: it then enters "at once" or never.
         d = np.where(np.abs(d) < 1e-20, 1e-20, d)
@@ -89,8 +89,7 @@ class Box:
         return np.minimum(a, b).max(axis=0), np.maximum(a, b).min(axis=0)
 
     def local(self, points: Array) -> Array:
-        moved = points - column(self.middle, points.dtype)
-        return self._turn(moved, -self.yaw) / column(self.half_sides, points.dtype)
+        return self._turn(points - column(self.middle, points.dtype), -self.yaw) / column(self.half_sides, points.dtype)
 
     def normals(self, points: Array) -> Array:
         local = self.local(points)
@@ -129,18 +128,19 @@ class World:
         falling = (directions[2] < 0.0) & (leaving != GROUND)
         to_ground = np.where(falling, -origins[2] / np.where(falling, directions[2], -1.0), np.inf)
         nearer = to_ground < distance
-        distance, surface[nearer] = np.where(nearer, to_ground, distance), GROUND
+        distance = np.where(nearer, to_ground, distance)
+        surface[nearer] = GROUND
 
         for number, solid in enumerate(self.solids, start=FIRST_SOLID):
             enter, leave = solid.interval(origins, directions)
             nearer = (enter < leave) & (enter > 0.0) & (enter < distance) & (leaving != number)
-            distance, surface[nearer] = np.where(nearer, enter, distance), number
+            distance = np.where(nearer, enter, distance)
+            surface[nearer] = number
         return distance, surface
 
     def normals(self, points: Array, surfaces: Array) -> Array:
         """Unit normals [3, N] on the side that is seen, at points [3, N] of the surfaces [N]."""
-        up = column((0.0, 0.0, 1.0), points.dtype)
-        normals = np.where(surfaces == SKY, -normalize(points), up)
+        normals = np.where(surfaces == SKY, -normalize(points), column((0.0, 0.0, 1.0), points.dtype))
         for number, solid in enumerate(self.solids, start=FIRST_SOLID):
             here = surfaces == number
             if here.any():

@@ -96,7 +96,8 @@ class Scene:
                 finish, paint = self.floor_finish, checkered_floor(points[:, here], self.noises[GROUND])
             else:
                 item = self.objects[number - FIRST_SOLID]
-                finish, paint = item.finish, item.paint(item.solid.local(points[:, here]), self.noises[number])
+                finish = item.finish
+                paint = item.paint(item.solid.local(points[:, here]), self.noises[number])
             diffuse = paint * irradiance[:, here] / np.pi
             if finish is None or self.config.gloss == 0.0:  # trace nothing that would be multiplied by zero
                 result[:, here] = diffuse
@@ -154,7 +155,8 @@ def studio_lamps() -> tuple[Lamp, ...]:
     """Twelve lamps of all hues, spread over the dome by the golden angle, 6 world units from the middle."""
     lamps = []
     for i in range(12):
-        angle, height = 2.0 * math.pi * (i * 0.5 * (math.sqrt(5.0) - 1.0) % 1.0), 0.25 + 0.7 * (i + 0.5) / 12
+        angle = 2.0 * math.pi * (i * 0.5 * (math.sqrt(5.0) - 1.0) % 1.0)
+        height = 0.25 + 0.7 * (i + 0.5) / 12
         across = math.sqrt(1.0 - height**2)
         red, green, blue = (6.5 + 3.25 * math.cos(angle - channel * 2.0 * math.pi / 3.0) for channel in range(3))
         position = 6.0 * across * math.cos(angle), 6.0 * across * math.sin(angle), 6.0 * height

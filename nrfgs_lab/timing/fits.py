@@ -41,7 +41,8 @@ class Fits:
 
     def main(self) -> None:
         records = lines_of(self.out)
-        done, method = [[record[key] for key in KEY] for record in records], f"{self.method} {self.options}".strip()
+        done = [[record[key] for key in KEY] for record in records]
+        method = f"{self.method} {self.options}".strip()
         cells = [("parts", of, count) for of in self.methods for count in self.splats]
         for cell in [*cells, *(("training", method, size) for size in self.gigabytes)]:
             if list(cell) in done:
@@ -63,7 +64,8 @@ class Fits:
 
     def parts(self, method: str, count: int) -> dict[str, Any]:
         """Megabytes of so many splats in training: their tensors' sizes, and what is free when these are gone."""
-        watch, device = Stopwatch(1), "cuda" if torch.cuda.is_available() else "cpu"
+        watch = Stopwatch(1)
+        device = "cuda" if torch.cuda.is_available() else "cpu"
         trainer = trained(method, at_megapixels(made(count), self.megapixels), device, watch)
         model, optimizers = trainer.pipeline.model, trainer.optimizers
         states = {name: optimizers.optimizers[name].state for name in model.gauss_params}
@@ -73,7 +75,8 @@ class Fits:
         del moments
 
         def forget_step() -> None:
-            trainer.graphs, model.info, model.watched = None, {}, {}
+            trainer.graphs = None
+            model.info, model.watched = {}, {}
 
         for name, forget in {
             "step": forget_step,

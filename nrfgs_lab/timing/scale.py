@@ -138,7 +138,8 @@ def resampled(config: Path, count: int) -> Capture:
     pipeline = load_training(config, "inference").pipeline
     table, data = pipeline.model.gauss_params, pipeline.datamanager
     views = evenly_spaced(len(data.cached_train), VIEWS)  # images before cameras, which they crop
-    draw, present = torch.Generator().manual_seed(0), len(table["means"])
+    draw = torch.Generator().manual_seed(0)
+    present = len(table["means"])
     rows = torch.cat([torch.randperm(present, generator=draw) for _ in range(-(-count // present))])[:count]
     splats = {name: table[name].detach().cpu()[rows] for name in GEOMETRY}
     splats["means"] += (count > present) * torch.randn(count, 3, generator=draw) * splats["scales"].exp()
@@ -234,8 +235,8 @@ class Bare:
     def gsplat(self, seen: Pinhole, K: list) -> Tensor:
         s = self.splats
         harmonics = torch.cat([s["features_dc"][:, None], s["features_rest"]], dim=1)
-        opacities, matrices = s["opacities"].sigmoid().flatten(), (seen.viewmat, seen.K, seen.width, seen.height)
-        table = s["means"], s["quats"], s["scales"].exp(), opacities, harmonics
+        matrices = seen.viewmat, seen.K, seen.width, seen.height
+        table = s["means"], s["quats"], s["scales"].exp(), s["opacities"].sigmoid().flatten(), harmonics
         return self.library.rasterization(*table, *matrices, sh_degree=3, packed=False)[0][0]
 
     def faster_gs(self, seen: Pinhole, K: list) -> Tensor:
@@ -266,7 +267,8 @@ class Scale:
         records = lines_of(self.out)
         if self.table:
             return print(as_table(records))
-        device, done = "cuda" if torch.cuda.is_available() else "cpu", {cell_of(record) for record in records}
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+        done = {cell_of(record) for record in records}
         needs = {of: BARE.get(of, "nerfstudio") for of in self.methods}
         cuda = {of for of in needs if device == "cuda" and find_spec(needs[of].partition(".")[0])}
         methods = [of for of in needs if of.startswith("nrfgs") or of in cuda]
@@ -285,7 +287,8 @@ class Scale:
     def measure(self, method: str, capture: Capture, sizes: tuple[str, ...]) -> dict[str, Any]:
         """Time and memory of a training's steps, and its frames per second at sizes of `FRAMES`."""
         device = "cuda" if torch.cuda.is_available() else "cpu"
-        watch, cameras = Stopwatch(self.steps), capture.cameras.to(device)
+        watch = Stopwatch(self.steps)
+        cameras = capture.cameras.to(device)
         views = [cameras[index : index + 1] for index in range(len(cameras))]
         if method in BARE:
             model = Bare(method, capture.splats, device)
@@ -295,7 +298,8 @@ class Scale:
                 model.step(views[step % len(views)], photographs[step % len(views)])
         else:
             trainer = trained(method, capture, device, watch)
-            model, trainer.graphs = trainer.pipeline.model.eval(), None
+            trainer.graphs = None
+            model = trainer.pipeline.model.eval()
         large = {size: [at_size(view, *FRAMES[size]) for view in views] for size in sizes}
         frames = {size: frames_per_second(model, cameras) for size, cameras in large.items()}
         return {"step_ms": watch.step_ms, "gpu_ms": watch.gpu_ms, "peak_mb": watch.peak_bytes / 1e6, **frames}
@@ -321,7 +325,8 @@ def add_line(file: Path, records: list[dict], cell: dict[str, Any], measure: Cal
 
 def as_table(records: list[dict[str, Any]]) -> str:
     """Markdown with the median of the repeats, and the least and the most."""
-    columns, groups = ("step_ms", "gpu_ms", "peak_mb", *FRAMES), {}
+    columns = "step_ms", "gpu_ms", "peak_mb", *FRAMES
+    groups = {}
     for record in records:
         groups.setdefault(cell_of(record)[:3], []).append(record)
     lines = []

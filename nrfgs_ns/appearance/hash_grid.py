@@ -51,7 +51,8 @@ class HashGrid(nn.Module):
         self, base_resolution: int, *, levels: int = 4, log2_table_size: int = 15, per_level_scale: float = 1.5
     ) -> None:
         super().__init__()
-        self.table_size, self.width = 2**log2_table_size, levels * FEATURES
+        self.table_size = 2**log2_table_size
+        self.width = levels * FEATURES
         steps = [int(base_resolution * per_level_scale**level) for level in range(levels)]
         sides = [2 * n for n in steps if (2 * n) ** 3 <= self.table_size]  # of the numbered levels: the first ones
         self.table = nn.Parameter(torch.empty(levels * self.table_size, FEATURES).uniform_(-1.0, 1.0) * INITIAL_RANGE)

@@ -74,10 +74,7 @@ class AppearanceHeadConfig:
     def require(self, holds: bool, name: str, needed: str) -> None:
         """Raise InputError naming field `name`, its value and what is `needed`, unless the condition holds."""
         if not holds:
-            raise InputError(
-                f"pipeline.model.appearance.{name} is {getattr(self, name)!r}, but it must be {needed}. "
-                f"Set --pipeline.model.appearance.{name.replace('_', '-')} accordingly."
-            )
+            raise InputError(f"pipeline.model.appearance.{name} is {getattr(self, name)!r}; it must be {needed}.")
 
 
 class AppearanceHead(nn.Module, ABC):
@@ -235,7 +232,8 @@ class ViewNoise:
     """
 
     def __init__(self, length: float, seed: int):
-        self.sigma, self.seed = length / math.sqrt(3.0), seed
+        self.sigma = length / math.sqrt(3.0)
+        self.seed = seed
         self._generators: dict[torch.device, torch.Generator] = {}
 
     def moved(self, splats: Mapping[str, Tensor], generator: torch.Generator | None) -> Mapping[str, Tensor]:
@@ -277,7 +275,8 @@ def failures_told(config: AppearanceHeadConfig) -> Iterator[None]:
 def check_head(head: AppearanceHead, splats: Mapping[str, Tensor]) -> None:
     """Raise InputError where a head breaks its contract. It is asked about one of its initial splats, in two rows
     beyond the table's end: a table of the head's own would miss the splats that densification adds."""
-    whose, count = f"{type(head).__module__}.{type(head).__name__}", len(splats["means"])
+    whose = f"{type(head).__module__}.{type(head).__name__}"
+    count = len(splats["means"])
 
     def require(what: str, value: Tensor, *shape: int) -> None:
         if value.dtype != torch.float32 or value.shape != shape or not value.isfinite().all():
@@ -299,7 +298,8 @@ def check_head(head: AppearanceHead, splats: Mapping[str, Tensor]) -> None:
     require("opacities of forward, for two splats,", answer.opacities, 2)
     require("colors of forward, for two splats,", answer.colors, 2, answer.colors.shape[-1] if head.at_pixel else 3)
     if head.at_pixel:
-        picture, rays = answer.colors[0].repeat(16, 16, 1), torch.tensor([0.0, 0.0, 1.0]).repeat(16, 16, 1)
+        picture = answer.colors[0].repeat(16, 16, 1)
+        rays = torch.tensor([0.0, 0.0, 1.0]).repeat(16, 16, 1)
         require("what image_of makes of 16 x 16 pixels", head.image_of(picture, rays), 16, 16, 3)
 
 

@@ -26,7 +26,7 @@ On the logit the residual scales with the opacity: n copies of a splat, each of 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args, get_type_hints
 
 import torch
 from torch import Tensor, nn
@@ -107,12 +107,8 @@ class NrfConfig(AppearanceHeadConfig):
         for name in ("color_scale", "opacity_scale"):
             self.require(getattr(self, name) >= 0, name, "zero or positive")
         self.require(self.distance_eps > 0, "distance_eps", "positive")
-        for name, choices in (
-            ("output_init", ("zero", "default")),
-            ("opacity_bound", (None, *OPACITY_BOUNDS)),
-            ("implementation", ("auto", "torch", "fused")),
-            ("precision", ("fp32", "tf32", "bf16", "fp16")),
-        ):
+        for name in ("output_init", "opacity_bound", "implementation", "precision"):
+            choices = (None, *OPACITY_BOUNDS) if name == "opacity_bound" else get_args(get_type_hints(NrfConfig)[name])
             self.require(getattr(self, name) in choices, name, "one of " + ", ".join(map(repr, choices)))
 
 
@@ -135,7 +131,8 @@ class NeuralResidualField(AppearanceHead):
     def __init__(self, config: NrfConfig):
         super().__init__()
         shared = config.latent_dim + 3 + int(config.use_distance)  # z, c, log r
-        low, high = 1 + 3 + BAND_DIM, BAND_DIM * (config.num_bands - 1)  # alpha, d and band 0; the other bands
+        low = 1 + 3 + BAND_DIM  # alpha, d and band 0
+        high = BAND_DIM * (config.num_bands - 1)  # the other bands
         outputs = 3 + int(config.opacity_residual)  # dc, d_alpha
         self.high: nn.Sequential | None = None
         if config.split_bands:
@@ -205,7 +202,8 @@ class NeuralResidualField(AppearanceHead):
         dc_high = gate = None
         if self.high is not None:
             detail = self.high(torch.cat([*shared, high], dim=-1))
-            dc_high, gate = detail[:, :3], torch.sigmoid(detail[:, 3:])
+            dc_high = detail[:, :3]
+            gate = torch.sigmoid(detail[:, 3:])
         return Branches(color, logit, out[:, :3], dc_high, gate, out[:, 3:] if self.config.opacity_residual else None)
 
     def _color_residual(self, out: Branches) -> Tensor:

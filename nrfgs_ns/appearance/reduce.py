@@ -43,11 +43,11 @@ def latent_basis(field: Field, weight: Tensor) -> LatentBasis:
     if not float(weight.sum()) > 0:
         weight = torch.ones_like(weight)
     weight = (weight / weight.sum()).double()[:, None]
-    mean, size = (weight * latents).sum(dim=0), latents.shape[1]
+    mean = (weight * latents).sum(dim=0)
+    size = latents.shape[1]
     weights = field.head.state_dict()
     first_layers = torch.cat([weights[f"{branch}.0.weight"][:, :size].double() for branch in branches(weights)])
-    gram = first_layers.T @ first_layers
-    values, vectors = torch.linalg.eigh(gram)
+    values, vectors = torch.linalg.eigh(first_layers.T @ first_layers)
     # Latents beside the layer's row space keep a millionth of the strongest one's metric: everything can be inverted.
     roots = values.clamp_min(max(float(values[-1]) * 1e-12, 1e-300)).sqrt()
     stretch, shrink = (vectors * roots) @ vectors.T, (vectors / roots) @ vectors.T
@@ -72,12 +72,12 @@ def with_components(field: Field, columns: Tensor) -> Field:
 
 def _folded(field: Field, reduced: Tensor, axes: Tensor, mean: Tensor) -> Field:
     """The same field of the latents y [N, R] with z = mean + axes y, all float64."""
-    latents, weights = field.splats["latents"], dict(field.head.state_dict())
+    weights = dict(field.head.state_dict())
     for branch in branches(weights):
         of_latents, others = weights[f"{branch}.0.weight"].double().tensor_split([len(axes)], dim=1)
         weights[f"{branch}.0.weight"] = torch.cat([of_latents @ axes, others], dim=1)
         weights[f"{branch}.0.bias"] = weights[f"{branch}.0.bias"].double() + of_latents @ mean
-    smaller = Field(field.head, {**field.splats, "latents": reduced.to(latents.dtype)})
+    smaller = Field(field.head, {**field.splats, "latents": reduced.to(field.splats["latents"].dtype)})
     return rebuilt(smaller, weights, latent_dim=axes.shape[1])
 
 
@@ -96,5 +96,4 @@ def build(config: NrfConfig, weights: Mapping[str, Tensor], scene_unit: float) -
 
 def rebuilt(field: Field, weights: Mapping[str, Tensor], **options: Any) -> Field:
     """The field with other weights and options of its head."""
-    head = field.head
-    return Field(build(replace(head.config, **options), weights, head.scene_unit), field.splats)
+    return Field(build(replace(field.head.config, **options), weights, field.head.scene_unit), field.splats)

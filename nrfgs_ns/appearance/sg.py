@@ -61,13 +61,13 @@ class SphericalGaussians(AppearanceHead):
     def splat_params(self, rgb: Tensor) -> dict[str, Tensor]:
         """Base colours "features_dc" [N, 3]; axes "sg_axes" [N, L, 3], of any length but zero; "sg_sharpness" [N, L],
         of any sign; amplitudes "sg_colors" [N, L, 3], in units of white."""
-        count, lobes = len(rgb), self.config.lobes
+        lobes = self.config.lobes
         axes = torch.eye(3, device=rgb.device)
         return {
             **super().splat_params(rgb),
-            "sg_axes": torch.cat([axes, -axes])[:lobes].repeat(count, 1, 1),
-            "sg_sharpness": torch.full((count, lobes), INITIAL_SHARPNESS, device=rgb.device),
-            "sg_colors": torch.zeros(count, lobes, 3, device=rgb.device),
+            "sg_axes": torch.cat([axes, -axes])[:lobes].repeat(len(rgb), 1, 1),
+            "sg_sharpness": torch.full((len(rgb), lobes), INITIAL_SHARPNESS, device=rgb.device),
+            "sg_colors": torch.zeros(len(rgb), lobes, 3, device=rgb.device),
         }
 
     def set_step(self, step: int) -> None:

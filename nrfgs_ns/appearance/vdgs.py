@@ -65,7 +65,8 @@ class ViewDirectionFactors(SphericalHarmonics):
 
     def components(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> dict[str, Component]:
         """The harmonics' "residual", and the factor's "opacity residual"."""
-        seen, base = self(splats, visible, camera_centers), self.base_appearance(splats, visible)
+        seen = self(splats, visible, camera_centers)
+        base = self.base_appearance(splats, visible)
         return {
             "residual": Component(seen.colors - base.colors, "color"),
             "opacity residual": Component((seen.opacities - base.opacities)[:, None], "opacity"),

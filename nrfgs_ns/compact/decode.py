@@ -2,7 +2,7 @@
 """Compact files read back as the tables of a model. `format.py`, `encode.py` and `entropy.py` specify the file."""
 
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -29,15 +29,6 @@ LARGEST = 1e18
 fit into float32."""
 
 
-class Render(NamedTuple):
-    """How a file is rendered."""
-
-    mode: Literal["classic", "antialiased"]
-    background: tuple[float, float, float]
-    near: float
-    """depth from which splats are drawn, in world units; 0: splatfacto's"""
-
-
 class Decoded(NamedTuple):
     """Content of a compact file."""
 
@@ -47,7 +38,6 @@ class Decoded(NamedTuple):
     """the head's, float32, by their names in its `state_dict`"""
     splats: dict[str, Tensor]
     """the table, float32"""
-    render: Render
     header: dict[str, Any]
 
 
@@ -61,7 +51,8 @@ def decode(path: Path) -> Decoded:
         check_keys(header["head"], ("name", "config", "scene_unit"), "the head")
         if header["format"] != FORMAT or header["head"]["name"] != "nrf":
             raise ValueError(f"it holds {header['format']!r} with a head named {header['head']['name']!r}")
-        config, render = _config(header["head"]), _render(header["render"])
+        config = _config(header["head"])
+        _check_render(header["render"])
         grids = _grids(header["grids"], config.latent_dim)
         streams = read_streams(data, header["streams"], first)
         _check_kinds(header["streams"])
@@ -70,13 +61,10 @@ def decode(path: Path) -> Decoded:
         build(config, weights, header["head"]["scene_unit"])  # RuntimeError for weights of other names and shapes
         if not all(weight.isfinite().all() for weight in weights.values()):
             raise ValueError("the head's weights are not finite")
-        return Decoded(config, weights, _splats(header["splats"], grids, streams), render, header)
+        return Decoded(config, weights, _splats(header["splats"], grids, streams), header)
     except BROKEN as error:
-        reason = " ".join(str(error).split())[:LONGEST_REASON]
-        raise InputError(
-            f"{path} cannot be read as a compact file ({type(error).__name__}: {reason}). Copy it again, or export it "
-            "again with nrfgs export compact."
-        ) from error
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:LONGEST_REASON]
+        raise InputError(f"{path} cannot be read as a compact file ({reason}). Copy or export it again.") from error
 
 
 def _is_number(value: Any, low: float, high: float) -> bool:
@@ -84,7 +72,8 @@ def _is_number(value: Any, low: float, high: float) -> bool:
 
 
 def _config(head: dict[str, Any]) -> NrfConfig:
-    usual, options = NrfConfig(opacity_bound=NrfConfig().bound), {}
+    usual = NrfConfig(opacity_bound=NrfConfig().bound)
+    options = {}
     for name, value in head["config"].items():
         kind = type(getattr(usual, name))
         if not (_is_number(value, -LARGEST, LARGEST) if kind is float else type(value) is kind):
@@ -99,7 +88,7 @@ def _config(head: dict[str, Any]) -> NrfConfig:
     return config
 
 
-def _render(render: dict[str, Any]) -> Render:
+def _check_render(render: dict[str, Any]) -> None:
     check_keys(render, ("rasterize_mode", "background"), "render", optional=("near_plane",))
     mode, background, near = render["rasterize_mode"], render["background"], render.get("near_plane", 0)
     if mode not in ("classic", "antialiased"):
@@ -108,7 +97,6 @@ def _render(render: dict[str, Any]) -> Render:
         raise ValueError(f"its background is {ascii(background)}")
     if not _is_number(near, 0, LARGEST):
         raise ValueError(f"the near plane is {ascii(near)}")
-    return Render(mode, tuple(background), float(near))
 
 
 def _check_kinds(entries: list[dict[str, Any]]) -> None:
@@ -139,8 +127,7 @@ def _grids(grids: dict[str, Any], latent_dim: int) -> dict[str, Grid]:
 def _splats(count: Any, grids: dict[str, Grid], streams: dict[str, np.ndarray]) -> dict[str, Tensor]:
     if type(count) is not int or count < 1:
         raise ValueError(f"{ascii(count)} splats")
-    rank = len(grids["latents"].step)
-    for name, columns in {"means": 2, "splats": sum(WIDTHS.values()), "latents": rank}.items():
+    for name, columns in {"means": 2, "splats": sum(WIDTHS.values()), "latents": len(grids["latents"].step)}.items():
         if streams[name].shape != (columns, count):
             raise ValueError(f"{name} of shape {list(streams[name].shape)} instead of {[columns, count]}")
     upper, lower = streams["means"].astype(np.uint64)
@@ -148,8 +135,7 @@ def _splats(count: Any, grids: dict[str, Grid], streams: dict[str, np.ndarray]) 
         raise ValueError("means beyond 63 bits")
     places = np.cumsum((upper << np.uint64(32)) | lower, dtype=np.uint64)
     codes = {"means": from_morton(places), "latents": streams["latents"].T}
-    ends = np.cumsum(list(WIDTHS.values()))
-    codes |= zip(WIDTHS, np.split(streams["splats"].T, ends[:-1], axis=1), strict=True)
+    codes |= zip(WIDTHS, np.split(streams["splats"].T, np.cumsum([*WIDTHS.values()])[:-1], axis=1), strict=True)
     with np.errstate(over="ignore"):  # what overflows is refused below
         values = {name: torch.from_numpy(grids[name].values(table.astype(np.float64))) for name, table in codes.items()}
     values["latents"] = values["latents"].float()  # the largest table by far, and no rotations to work out
@@ -170,6 +156,6 @@ def model_state(model, decoded: Decoded) -> dict[str, Any]:
             "head": decoded.header["head"]["name"],
             "densification": model.densification.name,
             "strategy": {},
-            "near": decoded.render.near,
+            "near": float(decoded.header["render"].get("near_plane", 0)),  # 0: splatfacto's
         },
     }

@@ -119,7 +119,8 @@ def growth_without(model, field: Field, views: Iterable[tuple[Any, dict[str, Any
         model: in training mode.
         views: training cameras and their photographs.
     """
-    count, device = len(field.splats["means"]), field.splats["means"].device
+    count = len(field.splats["means"])
+    device = field.splats["means"].device
     growth, error, loss = (torch.zeros(n, device=device) for n in (count, 1, 1))
     for number, (camera, batch) in enumerate(views, 1):
         gates = torch.ones(count, device=device, requires_grad=True)
@@ -168,10 +169,10 @@ def fine_tune(
     noise = ViewNoise(model.noise_factor * camera_spacing(cameras.camera_to_worlds[:, :3, 3]), torch.initial_seed())
     field = model.field.detached()
     # Latents begin as their own principal components.
-    basis = latent_basis(field, contributions_to(model, cameras))
-    field = with_rank(field, basis, field.head.config.latent_dim)
+    field = with_rank(field, latent_basis(field, contributions_to(model, cameras)), field.head.config.latent_dim)
     head = build(field.head.config, field.head.state_dict(), field.head.scene_unit).requires_grad_(True).train()
-    coded, count = CodedSplats(field.splats), len(field.splats["means"])
+    coded = CodedSplats(field.splats)
+    count = len(field.splats["means"])
     of_bits = torch.tensor(rate / (8 * count), device=model.device)  # loss of a bit
     smallest, largest = (limit / (8 * count) for limit in RATES_FOR_SIZE)
     haste = min(HASTE * EVERY / steps, HASTIEST)
@@ -208,8 +209,7 @@ def fine_tune(
         tables = coded(rounded=step >= NOISY * steps)
         splats = splats_of(tables)
         seen = noise.moved(splats, noise.generator(model.device, step))
-        outputs = model.render(Field(head, splats), camera, Field(head, seen))
-        loss = photometric(model, outputs, batch)
+        loss = photometric(model, model.render(Field(head, splats), camera, Field(head, seen)), batch)
         if step % EVERY == 0:
             bits = coded.bits(tables).sum()
             loss = loss + EVERY * of_bits * bits
@@ -228,5 +228,6 @@ def fine_tune(
     field = Field(head.requires_grad_(False).eval(), splats)
     used = (splats["latents"] != 0).any(dim=0).nonzero()[:, 0]
     if 0 < len(used) < splats["latents"].shape[1]:
-        field, grids["latents"] = with_components(field, used), grids["latents"][used.cpu().numpy()]
+        field = with_components(field, used)
+        grids["latents"] = grids["latents"][used.cpu().numpy()]
     return field, grids, float(of_bits) * 8 * count

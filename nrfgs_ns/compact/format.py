@@ -117,10 +117,12 @@ def read_header(data: bytes) -> tuple[dict[str, Any], int]:
 
 def read_streams(data: bytes, entries: list[dict[str, Any]], first: int) -> dict[str, np.ndarray]:
     """The streams, from byte `first` on, that the header's entries describe; errors as `read_header`."""
-    unpacked, streams = 0, {}
+    unpacked = 0
+    streams = {}
     for entry in entries:
         check_keys(entry, ENTRY, named := f"the stream {ascii(entry)}")
-        sizes, kinds = entry["shape"], (type(entry["name"]), type(entry["shape"]), type(entry["bytes"]))
+        sizes = entry["shape"]
+        kinds = type(entry["name"]), type(sizes), type(entry["bytes"])
         if kinds != (str, list, int) or entry["dtype"] not in CODINGS[entry["coding"]] or entry["name"] in streams:
             raise ValueError(named)
         if not all(type(size) is int and size >= 0 for size in sizes):
@@ -128,7 +130,8 @@ def read_streams(data: bytes, entries: list[dict[str, Any]], first: int) -> dict
         unpacked += math.prod(max(size, 1) for size in sizes) * np.dtype(entry["dtype"]).itemsize
         if unpacked > max(LARGEST_RATIO * len(data), SMALL):
             raise ValueError(f"{named} would unpack to more than {LARGEST_RATIO} times the file")
-        body, first = data[first : first + entry["bytes"]], first + entry["bytes"]
+        body = data[first : first + entry["bytes"]]
+        first += entry["bytes"]
         if len(body) != entry["bytes"] or zlib.crc32(body) != entry["crc32"]:
             raise ValueError(f"the checksum of its stream {entry['name']!r} does not hold")
         streams[entry["name"]] = (_uncoded if entry["coding"] == "rans" else _unpack)(entry, body)
@@ -164,7 +167,8 @@ def _pack(array: np.ndarray) -> bytes:
 
 
 def _unpack(entry: Mapping[str, Any], body: bytes) -> np.ndarray:
-    count, size = math.prod(entry["shape"]), np.dtype(entry["dtype"]).itemsize
+    count = math.prod(entry["shape"])
+    size = np.dtype(entry["dtype"]).itemsize
     unpacker = lzma.LZMADecompressor(format=lzma.FORMAT_XZ, memlimit=LARGEST_MEMORY)
     raw = unpacker.decompress(body, max_length=count * size + 1) if body else b""
     complete = not body or unpacker.eof and not unpacker.unused_data and unpacker.check == lzma.CHECK_NONE

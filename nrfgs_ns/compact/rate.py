@@ -83,8 +83,7 @@ class Density(nn.Module):
         upper, lower = (from_center + 0.5 * steps) / widths, (from_center - 0.5 * steps) / widths
         # F(a) - F(b) = F(a) F(-b) (1 - exp(b - a)), which does not vanish in the tails.
         inside = logsigmoid(upper) + logsigmoid(-lower) + torch.log(-torch.expm1(-steps / widths))
-        logs = torch.logsumexp(inside + self.log_shares.log_softmax(dim=-1), dim=-1)
-        return -logs.sum(dim=-1) / math.log(2.0)
+        return -torch.logsumexp(inside + self.log_shares.log_softmax(dim=-1), dim=-1).sum(dim=-1) / math.log(2.0)
 
 
 def _earlier(values: Tensor, count: int) -> Tensor:

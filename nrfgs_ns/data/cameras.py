@@ -60,7 +60,8 @@ def read_cameras(meta: dict[str, Any], source: Path, config: Any) -> tuple[Camer
         The cameras [V]; their intrinsics by `read_lenses`; the transform [3, 4] from the frames' world to the cameras',
         before scaling; and the scale, also of what was applied before.
     """
-    frames, lenses = meta["frames"], read_lenses(meta, source)
+    frames = meta["frames"]
+    lenses = read_lenses(meta, source)
     check_applied(meta, source)
     scaled = config.auto_scale_poses and len(frames) > 1
     poses = check_poses(frames, source, need_spread=scaled)
@@ -71,8 +72,8 @@ def read_cameras(meta: dict[str, Any], source: Path, config: Any) -> tuple[Camer
             "remove it."
         )
     placed, transform, scale = place(poses, orientation, config.center_method, scaled, config.scale_factor)
-    cameras = cameras_of(meta, lenses, placed, source)
-    return cameras, lenses, transform, scale * number(meta.get("applied_scale", 1.0))
+    scale *= number(meta.get("applied_scale", 1.0))
+    return cameras_of(meta, lenses, placed, source), lenses, transform, scale
 
 
 def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -> np.ndarray:
@@ -97,10 +98,8 @@ def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -
     rotation = poses[:, :3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         skew = np.abs(rotation.transpose(0, 2, 1) @ rotation - np.eye(3)).max((1, 2))
-    reject(
-        ~(skew <= ROTATION_TOLERANCE),
-        f"is not rigid (R^T R differs from 1 by {skew.max():.2g}). Take scale and shear out of the rotation",
-    )
+    fault = f"is not rigid (R^T R differs from 1 by {skew.max():.2g}). Take scale and shear out of the rotation"
+    reject(~(skew <= ROTATION_TOLERANCE), fault)
     reject(np.linalg.det(rotation) < 0, "mirrors (its rotation has determinant -1). Flip one camera axis")
 
     position = poses[:, :3, 3]
@@ -152,7 +151,8 @@ def place(
     if len(poses) == 1 and orientation == "vertical":  # needs two cameras
         orientation = "up"
     positions = poses[:, :3, 3]
-    center, extent = positions.mean(axis=0), np.ptp(positions, axis=0).max()
+    center = positions.mean(axis=0)
+    extent = np.ptp(positions, axis=0).max()
     far = centering != "none" and np.abs(center).max() > FAR * extent > 0
     offset = rounded(center, extent) if far else np.zeros(3)
     near = poses.copy()
@@ -161,10 +161,7 @@ def place(
         torch.from_numpy(near.astype(np.float32)), method=orientation, center_method=centering
     )
     if not torch.isfinite(transform).all():
-        raise InputError(
-            "The poses cannot be oriented, since their up directions cancel. Set the data parser's option "
-            "--orientation-method none, or recompute the poses."
-        )
+        raise InputError("The poses' up directions cancel. Give the parser --orientation-method none, or other poses.")
     reach = float(torch.max(torch.abs(placed[:, :3, 3])))
     scale = (1.0 / reach if auto_scale and reach > 0 else 1.0) * factor
     placed[:, :3, 3] *= scale
@@ -216,10 +213,7 @@ def _lens(values: dict[str, Any], source: Path) -> list[float]:
     stored = values.get("distortion_params", [values.get(key, 0.0) for key in DISTORTION])
     distortion = [number(value) for value in stored] if isinstance(stored, list) else []
     if len(distortion) != len(DISTORTION) or not np.isfinite(distortion).all():
-        raise InputError(
-            f"{source}: the distortion {of} is {shown(repr(stored))}. Give six numbers, 0 for none: "
-            f"{', '.join(DISTORTION)}."
-        )
+        raise InputError(f"{source}: distortion {of} is {shown(repr(stored))}. Give {', '.join(DISTORTION)} (0: none).")
     return pixels + distortion
 
 
@@ -265,7 +259,8 @@ def cameras_of(meta: dict[str, Any], lenses: np.ndarray, poses: Tensor, source: 
 def _check_distortion(lens: np.ndarray, kind: CameraType, where: str) -> None:
     """Check that undistorting leaves enough of the image."""
     fx, fy, cx, cy, w, h, k1, k2, k3, k4, p1, p2 = lens
-    K, size = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]]), (int(w), int(h))
+    K = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
+    size = int(w), int(h)
     if kind == CameraType.FISHEYE:
         flat = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
             K, np.array([k1, k2, k3, k4]), size, np.eye(3), balance=0
@@ -279,10 +274,7 @@ def _check_distortion(lens: np.ndarray, kind: CameraType, where: str) -> None:
         enough = part[2] * part[3] >= LEFT_OF_IMAGE * w * h and not _folds(K, parameters, size, flat, part)
     change = flat[[0, 1], [0, 1]] / (fx, fy)
     if not (enough and ((LEAST_FOCAL < change) & (change < MOST_FOCAL)).all()):
-        raise InputError(
-            f"{where} is so strong that undistorting leaves next to nothing of the image. Correct the parameters, or "
-            "undistort the photographs yourself."
-        )
+        raise InputError(f"{where} leaves next to nothing of the image. Correct it, or undistort the photographs.")
 
 
 def _folds(K: np.ndarray, distortion: np.ndarray, size: tuple[int, int], flat: np.ndarray, part: Sequence[int]) -> bool:
@@ -295,5 +287,4 @@ def _folds(K: np.ndarray, distortion: np.ndarray, size: tuple[int, int], flat: n
     taken = taken.reshape(*u.shape, 2)
     across, down = np.diff(taken, axis=1)[:-1], np.diff(taken, axis=0)[:, :-1]
     in_order = across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0] > 0
-    beside = np.abs(taken / size - 0.5).max() > 0.5 + MARGIN
-    return beside or not in_order.all()
+    return np.abs(taken / size - 0.5).max() > 0.5 + MARGIN or not in_order.all()

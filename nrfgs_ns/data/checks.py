@@ -111,7 +111,4 @@ def check_headers(paths: Sequence[Path], sizes: Sequence[tuple[int, int]], what:
     headers = [(path, read_size(path), tuple(size)) for path, size in zip(paths, sizes, strict=True)]
     wrong = [f"{path} is {w} x {h}, not {size[0]} x {size[1]}" for path, (w, h), size in headers if (w, h) != size]
     if wrong:
-        raise InputError(
-            f"{len(wrong)} {what} do not match the size w x h of their cameras (divided by the downscale factor): "
-            f"{some(wrong)}. {fix}"
-        )
+        raise InputError(f"{len(wrong)} {what} unlike their cameras' w x h / downscale factor: {some(wrong)}. {fix}")

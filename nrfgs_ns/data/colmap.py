@@ -110,12 +110,14 @@ def _photograph(id: int, pose: Sequence[float], camera: int, name: str) -> Photo
     if not (abs(np.linalg.norm(quaternion) - 1) <= QUATERNION_TOLERANCE and np.isfinite(position).all()):
         raise ValueError(f"the pose of {name} holds NaN or Inf, or a quaternion that is not of length 1")
     world_to_camera = np.eye(4)
-    world_to_camera[:3, :3], world_to_camera[:3, 3] = qvec2rotmat(quaternion), position
+    world_to_camera[:3, :3] = qvec2rotmat(quaternion)
+    world_to_camera[:3, 3] = position
     return Photograph(id, name, camera, world_to_camera)
 
 
 def _images_text(path: Path) -> list[Photograph]:
-    photographs, lines = [], iter(path.read_text(encoding="utf-8").splitlines())
+    photographs = []
+    lines = iter(path.read_text(encoding="utf-8").splitlines())
     for line in lines:
         if line.strip() and not line.lstrip().startswith("#"):
             id, *pose, camera, name = line.split(maxsplit=9)

@@ -118,11 +118,10 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
 
     def __init__(self, config: NrfgsDatamanagerConfig, *args: Any, **kwargs: Any):
         config.dataparser = checked(config.dataparser)
-        scale, memory = config.camera_res_scale_factor, config.image_memory
+        scale = config.camera_res_scale_factor
+        memory = config.image_memory
         if not 0 < scale <= 16:
-            raise InputError(
-                f"--pipeline.datamanager.camera-res-scale-factor is {scale}. Give more than 0, at most 16."
-            )
+            raise InputError(f"--pipeline.datamanager.camera-res-scale-factor is {scale}. Give more than 0, up to 16.")
         if memory is not None and not memory >= 0:
             raise InputError(f"--pipeline.datamanager.image-memory is {memory}. Give 0 or more gigabytes.")
         self._views: dict[int, Cameras] = {}
@@ -186,7 +185,8 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
     def _place(self) -> Literal["device", "memory", "files"]:
         """Where decoded images are kept: on the device if they take at most half of its free memory, else on the host,
         else in files."""
-        each, size = (1 if self.config.cache_images_type == "uint8" else 4), 0
+        each = 1 if self.config.cache_images_type == "uint8" else 4
+        size = 0
         for dataset in (self.train_dataset, self.eval_dataset):
             channels = 3 * each + (dataset._dataparser_outputs.mask_filenames is not None)
             size += channels * int((dataset.cameras.width.long() * dataset.cameras.height).sum())
@@ -197,8 +197,8 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         if size <= budget:
             return "memory"
         takes = f"Decoded images take {size / 1e9:.1f} GB, and may take {budget / 1e9:.1f}"
-        option, files = "--pipeline.datamanager.image-memory", f"they are read from files in {cache_folder()}."
-        CONSOLE.print(f"{takes} ({option}): {files}", markup=False, soft_wrap=True)
+        files = f"they are read from files in {cache_folder()}"
+        CONSOLE.print(f"{takes} (--pipeline.datamanager.image-memory): {files}.", markup=False, soft_wrap=True)
         return "files"
 
     def _load_images(
@@ -206,7 +206,8 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
     ) -> list[dict[str, Tensor]]:
         """All images of a split, decoded and undistorted; `_place` decides where, not `cache_images_device`."""
         dataset = self.train_dataset if split == "train" else self.eval_dataset
-        place, kind = self._place, self.config.cache_images_type
+        place = self._place
+        kind = self.config.cache_images_type
         read = from_files if place == "files" else undistorted
 
         def placed(data: dict[str, Any]) -> dict[str, Any]:
@@ -226,7 +227,8 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
 
     def sampling_state(self) -> dict[str, Any]:
         """State of the order of training cameras, of plain numbers, lists and tuples."""
-        unseen, generator = list(self.train_unseen_cameras), self.random_generator.getstate()
+        generator = self.random_generator.getstate()
+        unseen = list(self.train_unseen_cameras)
         return {"num_images": len(self.train_dataset), "unseen_cameras": unseen, "generator": generator}
 
     def load_sampling_state(self, state: dict[str, Any]) -> None:

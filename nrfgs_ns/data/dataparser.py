@@ -134,11 +134,8 @@ class NrfgsDataParser(DataParser):
         splits = self._splits(meta, source)
         rounding = getattr(config, "downscale_rounding_mode", "floor")
         cameras.rescale_output_resolution(scaling_factor=1.0 / factor, scale_rounding_mode=rounding)
-        if min(cameras.width.min(), cameras.height.min()) < SMALLEST:
-            raise InputError(
-                f"{source}: --downscale-factor {factor} leaves images of {cameras.width.min()} x "
-                f"{cameras.height.min()} pixels. Give a smaller one."
-            )
+        if (side := int(min(cameras.width.min(), cameras.height.min()))) < SMALLEST:
+            raise InputError(f"{source}: --downscale-factor {factor} leaves {side} pixels a side. Give a smaller one.")
         to_frames = COLMAP_TO_FRAMES if self._colmap.exists() else None
         if "applied_transform" in meta:
             to_frames = torch.tensor(np.array(meta["applied_transform"], dtype=np.float64))
@@ -177,17 +174,12 @@ class NrfgsDataParser(DataParser):
         named = self._named_splits(meta)
         if named and "train" not in named:
             there = next(iter(named.values()))[0]  # test_filenames, test_list.txt
-            raise InputError(
-                f"{source}: there is {there}, but no train_{there.partition('_')[2]}. Name the training images, too."
-            )
+            raise InputError(f"{source}: {there}, but no train_{there.partition('_')[2]}. Name the training images.")
         splits = (
             split_by_names(named, paths, self._file, source) if named else split_by_rule(self.config, paths, source)
         )
         if not len(splits["train"]):
-            raise InputError(
-                f"{source}: no image is left for training. Correct train_filenames if it is there, else --eval-mode, "
-                "--eval-interval or --train-split-fraction."
-            )
+            raise InputError(f"{source}: no image left for training. Correct train_filenames or --eval-mode's options.")
         return splits
 
     def _files(self, frames: list[dict[str, Any]], key: str, factor: int) -> list[Path]:
@@ -230,7 +222,8 @@ class NrfgsDataParser(DataParser):
                 finding = f"the point cloud holds {count} usable points, fewer than {MIN_POINTS}"
             warn(f"{data_set.source}: {finding}. Training starts from random points, which costs quality.")
             return {}
-        xyz, rgb, transform = torch.from_numpy(points[0]), torch.from_numpy(points[1]), points[2].double()
+        xyz, rgb = (torch.from_numpy(table) for table in points[:2])
+        transform = points[2].double()
         xyz = data_set.scale * (xyz @ transform[:, :3].T + transform[:, 3])
         near = torch.from_numpy(in_reach(xyz.numpy(), data_set.cameras, data_set.source))
         xyz, rgb = xyz[near].float(), rgb[near]

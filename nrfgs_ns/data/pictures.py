@@ -53,9 +53,7 @@ def open_picture(path: Path) -> Image.Image:
     """An image whose header alone is read; InputError if it is of no known format."""
     heif = is_heif(path)
     if heif and not reads_heif():
-        raise InputError(
-            f"{path} is a HEIC photograph, not read here: run `pip install pillow-heif`, or convert it to JPEG."
-        )
+        raise InputError(f"{path} is a HEIC photograph: run `pip install pillow-heif`, or convert it to JPEG.")
     with naming(path, "is not a readable image"):
         return Image.open(path, formats=(*FORMATS, "HEIF") if heif else FORMATS)
 
@@ -66,9 +64,7 @@ def naming(path: Path, finding: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        raise InputError(
-            f"{path} {finding} ({str(error) or type(error).__name__}). Restore the file, or leave it out."
-        ) from error
+        raise InputError(f"{path} {finding} ({str(error) or type(error).__name__}). Restore or remove it.") from error
 
 
 def picture_names(paths: Sequence[Path]) -> list[str]:
@@ -89,9 +85,7 @@ def read_size(path: Path) -> tuple[int, int]:
 def check_depth(image: Image.Image, path: Path) -> None:
     """Refuse more than 8 bits per channel, whose range is unknown: 12 bits in 16 would be black."""
     if image.mode[0] in "IF" or any(";16" in str(tile[3]) for tile in image.tile):
-        raise InputError(
-            f"{path} has more than 8 bits per channel (mode {image.mode}). Convert it to an 8-bit PNG or JPEG."
-        )
+        raise InputError(f"{path} has more than 8 bits a channel (mode {image.mode}). Convert it to 8-bit PNG or JPEG.")
 
 
 def read_picture(path: Path) -> Image.Image:
@@ -108,10 +102,7 @@ def read_mask(path: Path) -> Image.Image:
     """A decoded mask, of mode L: 0 outside, 255 inside."""
     with open_picture(path) as image:
         if image.mode not in MASK_MODES:
-            raise InputError(
-                f"{path}: a mask must have one grey channel (0 outside, anything else inside), not colours or a "
-                "palette. Save it as 8-bit grey."
-            )
+            raise InputError(f"{path}: a mask has one grey channel, 0 outside and more inside. Save it as 8-bit grey.")
         with naming(path, "cannot be decoded"):
             inside = np.array(image) > (HALF if image.format == "JPEG" else 0)
     return Image.fromarray(inside.astype(np.uint8) * 255)
@@ -136,7 +127,8 @@ def in_parallel(
     from nerfstudio.utils.rich_utils import CONSOLE  # slow to import, and not needed by `nrfgs prepare`
 
     width, height = max(sizes, key=math.prod, default=(1, 1))
-    each, free = BYTES_PER_PIXEL * width * height, free_memory()
+    each = BYTES_PER_PIXEL * width * height
+    free = free_memory()
     if each > free:
         raise InputError(
             f"Decoding an image of {width} x {height} takes about {each / 1e9:.1f} GB of memory, and {free / 1e9:.1f} "

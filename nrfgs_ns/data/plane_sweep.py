@@ -82,7 +82,9 @@ def small_views(images: Iterable[Tensor], masks: Iterable[Tensor | None], intrin
         intrinsics: of the images, [V, 3, 3].
         poses: world to camera, [V, 4, 4].
     """
-    device, small, intrinsics = poses.device, [], intrinsics.clone()
+    device = poses.device
+    intrinsics = intrinsics.clone()
+    small = []
     for index, (image, mask) in enumerate(zip(images, masks, strict=True)):
         image = image.to(device)
         image = image / 255.0 if image.dtype == torch.uint8 else image.float()
@@ -105,7 +107,8 @@ def visibility(views: Views, points: Tensor) -> Visibility:
     """Which views see which of the capture's own points [P, 3], occlusion aside."""
     rotation, shift = views.world_to_camera[:, :3, :3], views.world_to_camera[:, :3, 3]
     seen = points @ rotation.mT + shift[:, None]
-    depth, (height, width) = seen[..., 2], views.valid.shape[1:]
+    depth = seen[..., 2]
+    height, width = views.valid.shape[1:]
     places = (seen @ views.intrinsics.mT)[..., :2] / depth.clamp_min(1e-9)[..., None]
     inside = (depth > 0) & (places > 0).all(-1) & (places[..., 0] < width) & (places[..., 1] < height)
     centers = -(rotation.mT @ shift[..., None])[..., 0]
@@ -154,7 +157,8 @@ def sweep(views: Views, grey: Tensor, one: int, others: Tensor, planes: Tensor) 
     turned, shift = _transfer(views, one, others)
     rays = torch.einsum("sij,hwj->shwi", turned, _rays(views, one))
     height, width = own.shape[-2:]
-    size, decisive = own.new_tensor([width, height]), (len(others) + 1) // 2
+    size = own.new_tensor([width, height])
+    decisive = (len(others) + 1) // 2
     pictures = torch.cat([grey[others], views.valid[others, None].to(grey.dtype)], dim=1)
     volume = []
     for plane in planes:
@@ -162,7 +166,8 @@ def sweep(views: Views, grey: Tensor, one: int, others: Tensor, planes: Tensor) 
         ahead = places[..., 2] > 1e-6
         grid = places[..., :2] / places[..., 2:].clamp_min(1e-6) / size * 2 - 1
         warped = F.grid_sample(pictures, grid, padding_mode="zeros", align_corners=False)
-        other, usable = warped[:, :1], (warped[:, 1] > 0.99) & ahead
+        other = warped[:, :1]
+        usable = (warped[:, 1] > 0.99) & ahead
         means = _window_mean(torch.cat([other, other * other, other * own], dim=1))
         spread = (means[:, 1:2] - means[:, :1] ** 2).clamp_min(0.0)
         correlation = (means[:, 2:] - means[:, :1] * mean) / (spread * variance + 1e-8).sqrt()
@@ -213,9 +218,11 @@ def dense_points(
 def _agreed(views: Views, inverse: Tensor, good: Tensor, one: int, others: Tensor) -> tuple[Tensor, Tensor]:
     """Points of a view that `AGREEING` others have at the same depth. Takes their pixels out of `good`, so that each
     point comes once."""
-    chosen, world = good[one], torch.linalg.inv(views.world_to_camera[one])
+    chosen = good[one]
+    world = torch.linalg.inv(views.world_to_camera[one])
     xyz = _rays(views, one)[chosen] / inverse[one][chosen][:, None] @ world[:3, :3].T + world[:3, 3]
-    (height, width), pixels, same = good.shape[1:], [], []
+    height, width = good.shape[1:]
+    pixels, same = [], []
     for other in others.tolist():
         matrix = views.world_to_camera[other]
         seen = xyz @ matrix[:3, :3].T + matrix[:3, 3]
@@ -263,7 +270,8 @@ def _window_mean(images: Tensor) -> Tensor:
     half = WINDOW // 2
     for padding, dim in (((half, half), -1), ((0, 0, half, half), -2)):
         size = images.shape[dim]
-        padded, at = F.pad(images, padding), torch.arange(size, device=images.device)
+        padded = F.pad(images, padding)
+        at = torch.arange(size, device=images.device)
         images = padded.narrow(dim, 0, size).clone()
         for shift in range(1, WINDOW):
             images += padded.narrow(dim, shift, size)

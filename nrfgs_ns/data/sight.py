@@ -48,10 +48,7 @@ def check_sight(xyz: torch.Tensor, cameras: Cameras, names: Sequence[str], sourc
     blind = [name for name, seen in zip(names, visible, strict=True) if not seen.any()]
     share = torch.stack(visible).any(dim=0).float().mean().item()
     if not share >= FEWEST_SEEN:  # nor without points
-        raise InputError(
-            f"{source}: of the {len(xyz)} points to start from, {100 * share:.2g} % are in any of the {len(names)} "
-            f"training views. {ONE_WORLD}"
-        )
+        raise InputError(f"{source}: {100 * share:.2g} % of the {len(xyz)} points are in a training view. {ONE_WORLD}")
     middle = points.median(dim=0).values
     spread, away = ((places - middle).norm(dim=1).median() for places in (points, cameras.camera_to_worlds[:, :3, 3]))
     if spread <= LEAST_SPREAD * away:

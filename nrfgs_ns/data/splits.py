@@ -47,7 +47,8 @@ def split_by_names(named: Named, images: list[Path], path_of: Callable[[str], Pa
 def split_by_rule(config: Any, images: list[Path], source: Path) -> Rows:
     """Rows of the parts by the parser's `eval_mode`; InputError if it cannot split these images. A single image is for
     training."""
-    count, mode, every = len(images), config.eval_mode, config.eval_interval
+    count = len(images)
+    mode, every = config.eval_mode, config.eval_interval
     if count == 1:
         train, evaluated = [0], []
     elif mode == "interior":
@@ -60,8 +61,6 @@ def split_by_rule(config: Any, images: list[Path], source: Path) -> Rows:
         try:
             train, evaluated = getattr(nerfstudio_splits, f"get_train_eval_split_{mode}")(images, *option)
         except (AssertionError, ValueError, KeyError) as error:
-            raise InputError(
-                f"{source}: --eval-mode {mode} cannot split these images ({error}). Choose another."
-            ) from error
+            raise InputError(f"{source}: --eval-mode {mode} cannot split the images ({error}). Use another.") from error
     train, evaluated = (np.asarray(rows, dtype=np.int64) for rows in (train, evaluated))
     return {"train": train, "val": evaluated, "test": evaluated}

@@ -70,7 +70,8 @@ def nearest_depth(points: Tensor, cameras: Cameras) -> float:
         points: of the capture, [P, 3].
         cameras: pinhole cameras of the training, [V].
     """
-    points, nearest = points[:: max(len(points) // 10_000, 1)].float(), math.inf
+    points = points[:: max(len(points) // 10_000, 1)].float()
+    nearest = math.inf
     for camera in cameras:
         rotation, position = camera.camera_to_worlds[:3, :3], camera.camera_to_worlds[:3, 3]
         x, y, z = ((points - position) @ rotation).unbind(-1)
@@ -119,7 +120,8 @@ def _first_of_each(rows: np.ndarray) -> list[int]:
     """Indices of rows [V, K] that are not near an earlier one. Near linear: few of the rows kept find the same row."""
     from scipy.spatial import cKDTree
 
-    kept, near = [], np.zeros(len(rows), dtype=bool)
+    kept = []
+    near = np.zeros(len(rows), dtype=bool)
     tree = cKDTree(rows)
     for i in range(len(rows)):
         if not near[i]:

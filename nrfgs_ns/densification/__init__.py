@@ -38,7 +38,8 @@ def strategy_from(text: str) -> DensificationConfig:
     if name not in STRATEGIES:
         raise InputError(f"There is no strategy {name!r}; use one of {', '.join(STRATEGIES)}.")
     kinds = get_type_hints(STRATEGIES[name])
-    names, options = [field.name for field in fields(STRATEGIES[name])], {}
+    names = [field.name for field in fields(STRATEGIES[name])]
+    options = {}
     for setting in settings:
         option, _, value = setting.partition("=")
         option = option.strip().replace("-", "_")

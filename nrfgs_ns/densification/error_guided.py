@@ -122,20 +122,22 @@ class ErrorGuidedDensification(Densification):
         """Let the window's maxima be at least the step's."""
         self.make_tables((ERROR, WIDTH, CHANGE), count, info["radii"].device)
         error, gradients = (self.state[ERROR], info["means2d"].absgrad) if step < self.grow_until else (None, None)
-        tables = Tables(self.state[WIDTH], error, self.state.get(CHANGE))
-        remember(tables, info, 1.0, gradients, info.get("change"))
+        remember(Tables(self.state[WIDTH], error, self.state.get(CHANGE)), info, 1.0, gradients, info.get("change"))
 
     # What a refinement does.
 
     def _refine(self, step: int, info: Mapping[str, Any], splats: Splats, optimizers: Optimizers) -> None:
         """Replace the dead, split where the error is, and take a little from all opacities."""
-        state, count, self.moved_at = self.state, len(splats["means"]), step
-        opacities, wide = self.seen_opacity(splats["opacities"]), state[WIDTH] > WIDEST
+        self.moved_at = step
+        count = len(splats["means"])
+        width = self.state[WIDTH]
+        opacities = self.seen_opacity(splats["opacities"])
         dead = opacities < DEAD
-        parents = draw((opacities * (state[WIDTH] > 0)).masked_fill(dead, 0.0), int(dead.sum()))
-        places, grown = dead.nonzero()[:, 0][: len(parents)], parents[:0]
+        parents = draw((opacities * (width > 0)).masked_fill(dead, 0.0), int(dead.sum()))
+        places = dead.nonzero()[:, 0][: len(parents)]
+        grown = parents[:0]
         if step < self.grow_until:
-            weights, wanted = self._candidates(step, count, dead, wide, len(places))
+            weights, wanted = self._candidates(step, count, dead, width > WIDEST, len(places))
             wanted = self.fitting(step, info, splats, optimizers, max(min(wanted, self.config.most_splats - count), 0))
             grown = draw(weights.index_fill(0, parents, 0.0), wanted)
         split(splats, optimizers, torch.cat([parents, grown]), places)
@@ -152,7 +154,8 @@ class ErrorGuidedDensification(Densification):
         Without a budget: `SHARE` of the splats above the threshold, less those that replace dead ones, and all wide
         ones. With one, as many as the number lacks of its `course`.
         """
-        error, wide = self.state[ERROR].masked_fill(dead, 0.0), wide & ~dead
+        error = self.state[ERROR].masked_fill(dead, 0.0)
+        wide = wide & ~dead
         if self.budget:
             wanted = round(self.course(step, count, self.start, self.grow_until)) - count
             return error.masked_fill(wide, math.inf), wanted
@@ -219,9 +222,8 @@ def split(splats: Splats, optimizers: Optimizers, rows: Tensor, places: Tensor) 
         rows: different rows, int64 [M].
         places: rows to be overwritten by the first of them, int64 [at most M], none of them in `rows`.
     """
-    signs = torch.randint(0, 2, (len(rows), 3), device=rows.device) * 2.0 - 1.0
-    half = halves(splats, rows, signs)
-    taken, new = len(places), len(rows) - len(places)
+    half = halves(splats, rows, torch.randint(0, 2, (len(rows), 3), device=rows.device) * 2.0 - 1.0)
+    taken = len(places)
 
     def values(name: str, old: Tensor, sign: float) -> Tensor:
         if name == "means":
@@ -237,7 +239,7 @@ def split(splats: Splats, optimizers: Optimizers, rows: Tensor, places: Tensor) 
     def clear(table: Tensor) -> None:
         table[torch.cat([rows, places])] = 0.0
 
-    if new == 0:
+    if taken == len(rows):
         for name, parameter in splats.items():
             overwrite(name, parameter.data)
             for value in optimizers[name].state.get(parameter, {}).values():
@@ -252,6 +254,6 @@ def split(splats: Splats, optimizers: Optimizers, rows: Tensor, places: Tensor) 
     def moments(_: str, old: Tensor) -> Tensor:
         table = old.clone()
         clear(table)
-        return torch.cat([table, old.new_zeros(new, *old.shape[1:])])
+        return torch.cat([table, old.new_zeros(len(rows) - taken, *old.shape[1:])])
 
     _update_param_with_optimizer(grown, moments, splats, optimizers)

@@ -138,7 +138,8 @@ class GradientDensification(Densification):
 
     def __init__(self, config: GradientConfig, strategy: PruneBySeenOpacity, scene_unit: float | None):
         super().__init__(config)
-        self.strategy, strategy.seen_opacity = strategy, self.seen_opacity
+        self.strategy = strategy
+        strategy.seen_opacity = self.seen_opacity
         self.gradients = "absolute" if strategy.absgrad else "signed"
         self.bounds = {name: getattr(strategy, name) for name in STRATEGY_BOUNDS}
         self.measure_by_cameras = scene_unit is None
@@ -157,7 +158,8 @@ class GradientDensification(Densification):
             self.state["scene_scale"] = EXTENT_MARGIN * spread or 1.0  # one camera has no extent
 
     def post_backward(self, step, info, splats, optimizers) -> None:
-        strategy, self.shown = self.strategy, None
+        self.shown = None
+        strategy = self.strategy
         self.take_changes(info, len(splats["means"]))
         if step < strategy.refine_stop_iter:
             self._take_statistics(info, len(splats["means"]))
@@ -172,7 +174,8 @@ class GradientDensification(Densification):
 
     def _take_statistics(self, info: Mapping[str, Any], count: int) -> None:
         """Add a step's screen-space gradients, in an image of [-1, 1], and radii, in shares of the longer side."""
-        state, means2d = self.state, info["means2d"]
+        state = self.state
+        means2d = info["means2d"]
         gradients = means2d.absgrad if self.strategy.absgrad else means2d.grad
         self.make_tables(("grad2d", "count", "radii"), count, gradients.device)
         remember(Tables(state.get("radii"), state["grad2d"], state["count"]), info, 2.0, gradients, sums=True)
@@ -180,7 +183,8 @@ class GradientDensification(Densification):
     def _refine(self, step: int, info: Mapping[str, Any], splats, optimizers) -> None:
         """Grow and prune by gsplat's rules, and begin the statistics anew."""
         strategy, state = self.strategy, self.state
-        count, gradients = len(splats["means"]), state["grad2d"] / state["count"].clamp_min(1)
+        count = len(splats["means"])
+        gradients = state["grad2d"] / state["count"].clamp_min(1)
         threshold = self._threshold_for_budget(step, gradients) if self.budget else self.threshold
         strategy.grow_grad2d, strategy.grow_scale2d = threshold, self.widest
         growing = gradients > threshold
@@ -191,7 +195,8 @@ class GradientDensification(Densification):
             largest = gradients.kthvalue(count - room).values.item()  # the threshold is exclusive
             strategy.grow_grad2d, strategy.grow_scale2d = max(threshold, largest), math.inf
         duplicated, split = strategy._grow_gs(splats, optimizers, state, step)
-        grown, pruned = len(splats["means"]), 0
+        grown = len(splats["means"])
+        pruned = 0
         if not self.budget or step % strategy.reset_every >= RECOVERY * strategy.refine_every:
             pruned = strategy._prune_gs(splats, optimizers, state, step)
         if self.verbose:
@@ -208,12 +213,13 @@ class GradientDensification(Densification):
         Where the number is off its `course`, the logarithm of the threshold moves, by at most `LARGEST_STEP`. No more
         splats grow by their gradient than bring the number to its course; wide ones may be split besides.
         """
-        state, count = self.state, len(gradients)
+        state = self.state
+        count = len(gradients)
         goal = self.course(step, count, self.strategy.refine_start_iter, self.strategy.refine_stop_iter)
         if abs(count - goal) > DEAD_BAND * goal:
-            move = math.log(count / goal)
-            state[THRESHOLD] += max(-LARGEST_STEP, min(move, LARGEST_STEP))
-        threshold, room = self.threshold * math.exp(state[THRESHOLD]), max(round(goal) - count, 0)
+            state[THRESHOLD] += max(-LARGEST_STEP, min(math.log(count / goal), LARGEST_STEP))
+        threshold = self.threshold * math.exp(state[THRESHOLD])
+        room = max(round(goal) - count, 0)
         if room < count:  # the threshold is exclusive
             threshold = max(threshold, gradients.kthvalue(count - room).values.item())
         return threshold

@@ -80,7 +80,8 @@ class McmcDensification(Densification):
         """Move the dead and grow by 5 %. A new row has been changed by views as the splat that it was made from: its
         stored opacity is another, but the head would answer for it much as for that one."""
         dead = self.seen_opacity(splats["opacities"], before=False) <= MIN_OPACITY
-        moved, count = relocate(splats, optimizers, dead, MIN_OPACITY), len(splats["means"])
+        count = len(splats["means"])
+        moved = relocate(splats, optimizers, dead, MIN_OPACITY)
         wanted = max(min(self.budget, int(1.05 * count)) - count, 0)
         wanted = self.fitting(step, info, splats, optimizers, wanted)
         added = add_samples(splats, optimizers, wanted, MIN_OPACITY)

@@ -32,7 +32,8 @@ def most_splats(splats: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer
     while rows are added, parameters and moments are there twice. The training's largest image has `later_pixels` more
     than the present ones.
     """
-    device, count = splats["means"].device, len(splats["means"])
+    device = splats["means"].device
+    count = len(splats["means"])
     if device.type != "cuda" or count == 0:
         return sys.maxsize
     moments = [value for name in splats for value in optimizers[name].state.get(splats[name], {}).values()]

@@ -44,7 +44,8 @@ def split_evenly(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Ten
     n = copies.clamp(1, MAX_COPIES)
     # float64, and o short of 1: the terms alternate, and for n = 51 they are up to 1e5 times as large as their sum.
     o = opacities.double().clamp_max(1.0 - torch.finfo(torch.float32).eps)
-    each, k = -torch.expm1(torch.log1p(-o) / n), torch.arange(MAX_COPIES, device=o.device)
+    each = -torch.expm1(torch.log1p(-o) / n)
+    k = torch.arange(MAX_COPIES, device=o.device)
     signs = (1.0 - 2.0 * (k % 2)) / (k + 1.0).sqrt()
     terms = _BINOMIALS.to(o.device)[n] * signs * each[:, None] ** (k + 1)  # [M, 51]
     factor = o / terms.sum(dim=-1)
@@ -117,7 +118,8 @@ def _share_places(splats: Splats, rows: Tensor, count: int, min_opacity: float) 
     copies = torch.bincount(chosen, minlength=len(opacities))[chosen] + 1  # the drawn splat stays as one of them
     each, scales = split_evenly(opacities[chosen], splats["scales"][chosen].exp(), copies)
     each = each.clamp(min_opacity, 1.0 - torch.finfo(each.dtype).eps)
-    splats["opacities"].data[chosen], splats["scales"].data[chosen] = torch.logit(each)[:, None], scales.log()
+    splats["opacities"].data[chosen] = torch.logit(each)[:, None]
+    splats["scales"].data[chosen] = scales.log()
     return chosen
 
 
@@ -135,6 +137,5 @@ def add_noise(splats: Splats, size: float, opacities: Tensor) -> None:
     gate = torch.sigmoid(-NOISE_SHARPNESS * (opacities - NOISE_OPACITY))
     noise = torch.randn_like(splats["means"]) * (gate * size)[:, None]
     axes = normalized_quat_to_rotmat(F.normalize(splats["quats"], dim=-1))
-    variances = (2.0 * splats["scales"]).exp()
-    along = torch.einsum("nij,ni->nj", axes, noise) * variances
+    along = torch.einsum("nij,ni->nj", axes, noise) * (2.0 * splats["scales"]).exp()
     splats["means"].add_(torch.einsum("nij,nj->ni", axes, along))

@@ -49,7 +49,8 @@ launch = Launcher(take_kernel)
 
 def take(tables: Tables, step: Step, gradients: Tensor | None, change: Tensor | None, sums: bool) -> None:
     """`statistics.in_torch` of float32 tensors, dense, and rows that are all different."""
-    count, written = len(step.rows), [table for table in tables if table is not None]
+    count = len(step.rows)
+    written = [table for table in tables if table is not None]
     if count > 0:
         arguments = *tables, step.rows, step.radii.contiguous(), gradients, change
         arguments = (written[0] if value is None else value for value in arguments)  # which is not touched

@@ -9,7 +9,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, MutableMapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -120,9 +120,8 @@ class DensificationConfig(ABC):
     def require(self, holds: bool, name: str, needed: str) -> None:
         """Raise InputError naming option `name`, its value and what is `needed`, unless the condition holds."""
         if not holds:
-            raise InputError(
-                f"--pipeline.model.densification {self.name}: {name} is {getattr(self, name)}; it must be {needed}."
-            )
+            option = f"--pipeline.model.densification {self.name}: {name}"
+            raise InputError(f"{option} is {getattr(self, name)}; it must be {needed}.")
 
     def share_of(self, rank: int, devices: int) -> "DensificationConfig":
         """The options for one of several devices, each of which has a part of the splats."""
@@ -133,17 +132,6 @@ class DensificationConfig(ABC):
         changed = ((field.name, getattr(self, field.name)) for field in fields(self))
         default = type(self)()
         return ",".join([self.name, *(f"{n}={v}" for n, v in changed if v != getattr(default, n))])
-
-
-class Shown(NamedTuple):
-    """What the views of a step have shown."""
-
-    rows: Tensor
-    """splats, int64 [M]; one that several cameras see is there several times"""
-    opacities: Tensor
-    """theirs, from there, [M] in [0, 1]"""
-    cameras: int
-    """number of cameras"""
 
 
 class Densification(ABC):
@@ -169,7 +157,9 @@ class Densification(ABC):
         """Number of splats to grow to; 0: as many as the rules give."""
         seen = (CHANGE, CHANGE_BEFORE)[:windows] if self.opacity_seen == "peak" else ()
         self.state = {HELD: None, **dict.fromkeys((FIRST, *seen) if self.budget else seen)}
-        self.shown: Shown | None = None
+        self.shown: tuple[Tensor, Tensor, int] | None = None
+        """What the views of a step have shown: rows of splats, int64 [M], as often as cameras see them; their opacities
+        from there, [M] in [0, 1]; and the number of cameras."""
 
     def needs_absgrad(self, step: int) -> bool:
         """Whether the rasterizer must leave sum |dL/dmean2d| in `info["means2d"].absgrad` in this step."""
@@ -207,7 +197,7 @@ class Densification(ABC):
             opacities: what the head said, [M] in [0, 1], before antialiasing compensation.
             logits: the stored opacities of all splats, as logits [N, 1].
         """
-        self.shown = Shown(info["gaussian_ids"], opacities, info.get("n_cameras", 1))
+        self.shown = (info["gaussian_ids"], opacities, info.get("n_cameras", 1))
         if self.gradients != "none" and not self.rests_at(step):
             info["means2d"].retain_grad()
         if self.opacity_seen == "peak":
@@ -224,8 +214,7 @@ class Densification(ABC):
         """Make the named statistics of splats that the state lacks yet."""
         for name in names:
             if name in self.state and self.state[name] is None:
-                empty = UNSEEN if name == CHANGE else 0.0
-                self.state[name] = torch.full((count,), empty, device=device)
+                self.state[name] = torch.full((count,), UNSEEN if name == CHANGE else 0.0, device=device)
 
     def take_rows(self, rows: Tensor, count: int) -> None:
         """Let these rows of the `count` present ones, in this order, be the statistics' rows."""
@@ -244,7 +233,8 @@ class Densification(ABC):
         is in checkpoints, so that a continued training has the same, unless it has more memory, or less. Before it is
         near, memory may slow growth, which a continued training need not repeat to the bit.
         """
-        count, within = len(splats["means"]), self.least(memory.allowed(splats["means"].device))
+        count = len(splats["means"])
+        within = self.least(memory.allowed(splats["means"].device))
         if self.state[HELD] is None or self.state[HELD][1] != within:
             later = max(self.pixels - info["width"] * info["height"], 0)
             most = self.least(memory.most_splats(splats, optimizers, later))

@@ -15,14 +15,10 @@ ROWS_AT_ONCE = 2**18
 """Rows of a device gathered at a time, which bounds what the main device needs beside its shard."""
 
 
-def rank() -> int:
-    """This device's number, from 0. Device 0 is the main one."""
-    return dist.get_rank()
-
-
-def world() -> int:
-    """Number of devices W."""
-    return dist.get_world_size()
+rank = dist.get_rank
+"""This device's number, from 0. Device 0 is the main one."""
+world = dist.get_world_size
+"""Number of devices W."""
 
 
 def swap(rows: Tensor, sent: list[int], received: list[int]) -> Tensor:

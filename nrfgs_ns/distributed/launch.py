@@ -23,12 +23,9 @@ def prepare(config: TrainerConfig) -> None:
         InputError: the devices are CPUs, or this machine has fewer GPUs than the training asks for.
     """
     if config.machine.device_type == "cpu":
-        raise InputError(
-            "ns-train starts several processes on GPUs only. To try it on CPUs, use python -m "
-            "nrfgs_lab.many_processes with the same options."
-        )
-    wanted, present = config.machine.num_devices, torch.cuda.device_count()
-    if present < wanted:
+        raise InputError("Several processes need GPUs; on CPUs use python -m nrfgs_lab.many_processes, same options.")
+    wanted = config.machine.num_devices
+    if (present := torch.cuda.device_count()) < wanted:
         raise InputError(f"machine.num_devices is {wanted}, but this machine shows {present} GPUs.")
     explain_losses(config)
 

@@ -87,14 +87,14 @@ class ShardedModel(NrfgsModel):
         """Render this device's camera (`get_outputs`), given those of all W devices in their order."""
         pinholes = [self.pinhole(camera) for camera in cameras]
         self.sizes = [(one.width, one.height) for one in pinholes]
-        own, field = comm.rank(), self.field
-        mine = pinholes[own]
+        field = self.field
+        own = comm.rank()
         projection = self._project_everywhere(field.splats, pinholes)
         centers = torch.stack([one.center for one in pinholes]).index_select(0, projection.camera_ids)
         appearance = self.noisy(field).seen_from(View(projection, centers))
         drawn, arrived = send_to_cameras(projection, appearance, *self.sizes[own], self.needs_absgrad)
         look = self.look_of(self._photograph_of(cameras[own]))
-        outputs, _ = self.composite(View(drawn, mine.center, pinhole=mine), arrived, look=look)
+        outputs, _ = self.composite(View(drawn, pinholes[own].center, pinhole=pinholes[own]), arrived, look=look)
         self.info = {name: getattr(projection, name) for name in ROWS}  # the image's rows are other devices' splats
         if self.training:
             self.densification.pre_backward(self.step, self.info, appearance.opacities, field.splats["opacities"])
@@ -106,7 +106,7 @@ class ShardedModel(NrfgsModel):
     def _project_everywhere(self, splats: Mapping[str, Tensor], pinholes: list[Pinhole]) -> Projection:
         """This device's splats in all cameras; at once if they have the same size."""
         if len(set(self.sizes)) == 1:
-            viewmats, Ks = torch.cat([one.viewmat for one in pinholes]), torch.cat([one.K for one in pinholes])
+            viewmats, Ks = (torch.cat([getattr(one, name) for one in pinholes]) for name in ("viewmat", "K"))
             geometry = splats["means"], splats["quats"], splats["scales"].exp()
             return project(*geometry, viewmats, Ks, *self.sizes[0], self.projection_options)
         parts = [project_view(splats, one, self.projection_options).projection for one in pinholes]
@@ -181,8 +181,8 @@ class ShardedModel(NrfgsModel):
 
     def load_state_dict(self, state: dict[str, Any], strict: bool = True, **kwargs):
         """Load this device's rows of a whole checkpoint. See `NrfgsModel.load_state_dict`."""
-        total, devices = len(state["gauss_params.means"]), comm.world()
+        total = len(state["gauss_params.means"])
+        devices = comm.world()
         self.loaded = rows_of(comm.rank(), total, devices)
         self.counts = shard_counts(total, devices)
-        mine = map_model_rows(state, lambda table: table[self.loaded])
-        return super().load_state_dict(mine, strict=strict, **kwargs)
+        return super().load_state_dict(map_model_rows(state, lambda table: table[self.loaded]), strict=strict, **kwargs)

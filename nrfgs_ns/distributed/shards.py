@@ -35,7 +35,8 @@ def rows_of(rank: int, total: int, devices: int) -> slice:
 def map_model_rows(state: Mapping[str, Any], change: Callable[[Tensor], Any], prefix: str = "") -> dict[str, Any]:
     """A model's state, its entries named after `prefix`, with each table of splats, and of densification's statistics,
     changed."""
-    rows, extra = f"{prefix}{PREFIX}", state[f"{prefix}_extra_state"]
+    rows = f"{prefix}{PREFIX}"
+    extra = state[f"{prefix}_extra_state"]
     statistics = per_splat(extra["strategy"], len(state[f"{rows}means"]))
     strategy = {**extra["strategy"], **{name: change(value) for name, value in statistics.items()}}
     changed = {name: change(value) if name.startswith(rows) else value for name, value in state.items()}
@@ -78,16 +79,17 @@ def rebalance(
 
     The rows that leave are spread evenly over the shard: new splats, which come last, crowd where the scene grows.
     """
-    plan, rank = transfers(counts), comm.rank()
+    rank = comm.rank()
+    plan = transfers(counts)
     sent, received = plan[rank], [row[rank] for row in plan]
-    count, leaving = counts[rank], sum(sent)
+    count = counts[rank]
+    leaving = sum(sent)
     device = splats["means"].device
     going = torch.arange(leaving, device=device) * count // max(leaving, 1)
     staying = torch.ones(count, dtype=torch.bool, device=device).index_fill(0, going, False).nonzero().squeeze(1)
 
     def moved(rows: Tensor) -> Tensor:
-        arrived = comm.swap(rows.index_select(0, going), sent, received)
-        return torch.cat([rows.index_select(0, staying), arrived])
+        return torch.cat([rows.index_select(0, staying), comm.swap(rows.index_select(0, going), sent, received)])
 
     statistics = per_splat(state, count)
     for name in sorted(splats):  # in the same order on all devices

@@ -46,8 +46,7 @@ class ShardedPipeline(NrfgsPipeline):
     model: ShardedModel
 
     def __init__(self, config: NrfgsPipelineConfig, device: str, test_mode: str = "val", world_size: int = 1, **kwargs):
-        sharded = partial(ShardedModel, sharding=config.sharding)
-        config = replace(config, model=replace(config.model, _target=sharded))
+        config = replace(config, model=replace(config.model, _target=partial(ShardedModel, sharding=config.sharding)))
         super().__init__(config, device, test_mode, world_size=1, **kwargs)
         self.world_size = world_size
         torch.manual_seed(torch.initial_seed() + 1 + comm.rank())
@@ -190,7 +189,8 @@ class ShardedTrainer(NrfgsTrainer):
         self.start_densely()
         self.guard = ShardedGuard(self.pipeline, self.request)
         self.mean = ShardedMean() if self.config.average_steps > 0 else None
-        groups, every = self.pipeline.get_param_groups(), self.config.logging.steps_per_log
+        groups = self.pipeline.get_param_groups()
+        every = self.config.logging.steps_per_log
         return ShardedOptimizers(self.pipeline.model, self.optimizer_configs(), groups, every)
 
     def _checkpoint(self, step: int) -> dict[str, Any]:

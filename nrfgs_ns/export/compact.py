@@ -53,20 +53,18 @@ def export_compact(
         f"{ply_size / size:.1f} times as much."
     ]
     lines += [lost(numbers)] if measure else []
-    file, saved = quote(str(output)), quote(str(config))
-    lines += [f"Look at it with:  nrfgs view {file}", f"Evaluate it with:  ns-eval --load-config {saved}"]
+    lines.append(f"Look at it with:  nrfgs view {quote(str(output))}")
+    lines.append(f"Evaluate it with:  ns-eval --load-config {quote(str(config))}")
     finish(lines, numbers, report)
 
 
 def load_field(load_config: Path, measured: bool) -> NrfgsPipeline:
     """A trained pipeline, as by `load_model`; InputError if its head is not a neural residual field."""
     pipeline = load_model(load_config, "test", measured)
-    pipeline.model.head.require_splat_colors()
-    if not isinstance(pipeline.model.head, NeuralResidualField):
-        raise InputError(
-            f"{load_config}: compact files and pages hold a neural residual field, and this model has the "
-            f"{pipeline.model.head.name!r} head. Use nrfgs export ply."
-        )
+    head = pipeline.model.head
+    head.require_splat_colors()
+    if not isinstance(head, NeuralResidualField):
+        raise InputError(f"{load_config}: no compact file can hold the {head.name!r} head. Use nrfgs export ply.")
     return pipeline
 
 
@@ -83,8 +81,10 @@ def write_file(
     Args:
         total: bytes of the compact file -> bytes of all that is written, for `options.size_mb`.
     """
-    model, times, rate = pipeline.model, [perf_counter()], None
-    field, steps = model.field.detached(), None
+    times = [perf_counter()]
+    model = pipeline.model
+    field = model.field.detached()
+    steps = rate = None
     render = {"rasterize_mode": model.config.rasterize_mode, "background": model.background_color.tolist()}
     render["near_plane"] = model.projection_options.near_plane
     limit = None if options.size_mb is None else 1e6 * options.size_mb
@@ -106,7 +106,8 @@ def write_file(
     times.append(perf_counter())
     decoded = decode(output)
     times.append(perf_counter())
-    config, count = write_config(load_config, output, decoded.config), len(decoded.splats["means"])
+    config = write_config(load_config, output, decoded.config)
+    count = len(decoded.splats["means"])
     numbers = {
         "splats": model.num_points,
         "written": count,
@@ -184,7 +185,9 @@ def write_config(load_config: Path, output: Path, head: NrfConfig) -> Path:
     whose path is returned, and an empty checkpoint. Its paths are absolute, as those of trainings."""
     config = read_config(load_config)
     find_data(config, load_config)
-    config.output_dir, config.experiment_name, config.timestamp = output.parent, f"{output.name}.nerfstudio", "compact"
+    config.output_dir = output.parent
+    config.experiment_name = f"{output.name}.nerfstudio"
+    config.timestamp = "compact"
     config.relative_model_dir = Path("nerfstudio_models")
     config.load_dir = config.load_checkpoint = config.load_step = None
     config.pipeline.model.appearance = head
@@ -196,6 +199,7 @@ def write_config(load_config: Path, output: Path, head: NrfConfig) -> Path:
     step = max(config.max_num_iterations, 1) - 1
     torch.save({"step": step, "pipeline": {}}, models / f"step-{step:09d}.ckpt")
     path = config.get_base_dir() / "config.yml"
-    config.output_dir, config.pipeline.compact = output.parent.absolute(), output.absolute()
+    config.output_dir = output.parent.absolute()
+    config.pipeline.compact = output.absolute()
     write_whole(path, yaml.dump(config))
     return path

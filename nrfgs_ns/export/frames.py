@@ -67,7 +67,8 @@ def to_capture(outputs: DataparserOutputs) -> tuple[Similarity, np.ndarray]:
     The origin, float64 [3], is a point amid the cameras, to be subtracted before rounding to float32; 0 where float32
     is enough.
     """
-    transform, scale = outputs.dataparser_transform, float(outputs.dataparser_scale)
+    transform = outputs.dataparser_transform
+    scale = float(outputs.dataparser_scale)
     rotation = transform[:, :3].double().T
     back = -rotation @ transform[:, 3].double()
     origin = rounded(back.numpy(), 1 / scale) if transform.dtype == torch.float64 else np.zeros(3)

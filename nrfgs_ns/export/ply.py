@@ -58,7 +58,8 @@ def export_ply(load_config: Path, output: Path, options: PlyOptions, measure: bo
         seconds = perf_counter() - begin
         # Brush's mark, which splat-transform reads, too: the splats are dimmed for the blur that a renderer adds.
         comments = ["SplatRenderMode: mip"] if pipeline.model.config.rasterize_mode == "antialiased" else []
-        placed, origin = Y_DOWN if options.world == "viewers" else NOWHERE, np.zeros(3)
+        placed = Y_DOWN if options.world == "viewers" else NOWHERE
+        origin = np.zeros(3)
         if options.world == "capture":
             placed, origin = to_capture(pipeline.datamanager.train_dataparser_outputs)
             comments.append(f"origin {' '.join(f'{number:.17g}' for number in origin)}")
@@ -132,8 +133,7 @@ def render_splats(
     """Render a file's splats over a background [3] with this project's rasterizer, [H, W, 3] in [0, 1]."""
     field = Field(ShConfig(degree=3).setup(), splats._asdict())
     planes = (scene_unit * plane for plane in (ProjectionOptions.near_plane, ProjectionOptions.far_plane))
-    options = ProjectionOptions(rasterize_mode, *planes)
-    view = project_view(field.splats, _pinhole(camera, splats.means.device), options)
+    view = project_view(field.splats, _pinhole(camera, splats.means.device), ProjectionOptions(rasterize_mode, *planes))
     return composite_view(view, field.seen_from(view), background.to(splats.means.device))[0]["rgb"]
 
 

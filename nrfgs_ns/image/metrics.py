@@ -110,8 +110,7 @@ def ssim_maps(pred: Tensor, gt: Tensor) -> tuple[Tensor, Tensor]:
     taps = torch.arange(WINDOW_SIZE, dtype=gt.dtype, device=gt.device) - REACH
     gauss = torch.exp(-taps.square() / (2 * WINDOW_SIGMA**2))
     gauss = gauss / gauss.sum()
-    moments = blur(torch.cat([pred, gt, pred * pred, gt * gt, pred * gt]), gauss)
-    mu_p, mu_g, square_p, square_g, cross = moments.split(3)
+    mu_p, mu_g, square_p, square_g, cross = blur(torch.cat([pred, gt, pred * pred, gt * gt, pred * gt]), gauss).split(3)
     cs_map = (2 * (cross - mu_p * mu_g) + SSIM_C2) / (square_p - mu_p**2 + square_g - mu_g**2 + SSIM_C2)
     ssim_map = cs_map * (2 * mu_p * mu_g + SSIM_C1) / (mu_p**2 + mu_g**2 + SSIM_C1)
     return ssim_map, cs_map
@@ -132,8 +131,8 @@ def image_metrics(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> dict[
     """
     gt = gt.to(pred.device)
     mask = None if mask is None else mask.to(pred.device)
-    images, metrics = (pred, fit_colors(pred, gt, mask)), (psnr, ssim, ms_ssim, l1, _lpips)
-    values = [metric(image, gt, mask) for image in images for metric in metrics]
+    images = pred, fit_colors(pred, gt, mask)
+    values = (metric(image, gt, mask) for image in images for metric in (psnr, ssim, ms_ssim, l1, _lpips))
     return dict(zip(METRIC_NAMES, values, strict=True))
 
 

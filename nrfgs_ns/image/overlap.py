@@ -94,7 +94,8 @@ def sight(points: Tensor, viewmat: Tensor, K: Tensor, image: Tensor, mask: Tenso
     points, viewmat, K = (value.to(image.device, torch.float32) for value in (points, viewmat, K))
     # Not as matrix products: cuBLAS would keep 32 MiB of a GPU for each thread that asks for one.
     seen = (points[:, None] * viewmat[:3, :3]).sum(dim=-1) + viewmat[:3, 3]
-    depth, pixel = seen[:, 2], (seen[:, None] * K).sum(dim=-1)
+    depth = seen[:, 2]
+    pixel = (seen[:, None] * K).sum(dim=-1)
     x, y = pixel[:, 0] / depth, pixel[:, 1] / depth
     rows = ((depth > 0) & (x >= window) & (x < width - window) & (y >= window) & (y < height - window)).nonzero()[:, 0]
     x, y, depth = x[rows].long(), y[rows].long(), depth[rows]
@@ -204,11 +205,13 @@ def estimate(pairs: Pairs, known: Tensor, centers: Tensor) -> Looks:
         centers: of the cameras. [V, 3]
     """
     count = len(known)
-    expected, there = torch.zeros(count, 3, dtype=torch.float64), torch.isfinite(known)
+    expected = torch.zeros(count, 3, dtype=torch.float64)
+    there = torch.isfinite(known)
     if there.any():
-        factor = slope(pairs, known)
-        expected[there, 0] = factor * (known[there] - known[there].mean()).double()
-    usual, random, places = USUAL_STOPS, [0.0, 0.0, 0.0], None
+        expected[there, 0] = slope(pairs, known) * (known[there] - known[there].mean()).double()
+    usual = USUAL_STOPS
+    random = [0.0, 0.0, 0.0]
+    places = None
     if count > MOST_PHOTOGRAPHS:
         first = (pairs.first < MOST_PHOTOGRAPHS) & (pairs.second < MOST_PHOTOGRAPHS)
         part = Pairs(*(value[first] for value in pairs))
@@ -216,10 +219,12 @@ def estimate(pairs: Pairs, known: Tensor, centers: Tensor) -> Looks:
         usual = random if any(random) else usual
     elif len(pairs.first) >= FEWEST_PAIRS:
         places = _places(centers)
-    size, ones = len(pairs.first), np.ones(len(pairs.first))
+    size = len(pairs.first)
+    ones = np.ones(size)
     ends = np.tile(np.arange(size), 2), torch.cat([pairs.second, pairs.first]).numpy()
     difference = csr_array((np.concatenate([ones, -ones]), ends), shape=(size, count))
-    stops, held = torch.empty_like(expected), []
+    stops = torch.empty_like(expected)
+    held = []
     for column in range(3):
         weight = pairs.spread[:, column].double().clamp_min(SMALLEST_SPREAD).numpy() ** -2
         missing = pairs.shift[:, column].double().numpy() - difference @ expected[:, column].numpy()
@@ -227,7 +232,8 @@ def estimate(pairs: Pairs, known: Tensor, centers: Tensor) -> Looks:
         seen = difference.T @ (weight * missing)
         # mean of s given the pairs: cov(s, d) (cov(d) + precision^-1)^-1, written without inverting the precision
         if places is None:
-            variance, patterns = usual[column] ** 2, _constant(count)
+            variance = usual[column] ** 2
+            patterns = _constant(count)
             own = torch.from_numpy(spsolve((eye_array(count) + variance * precision).tocsc(), seen))
         else:
             precision, seen = torch.from_numpy(precision.toarray()), torch.from_numpy(seen)
@@ -247,7 +253,8 @@ def _constant(count: int) -> Tensor:
 def _places(centers: Tensor) -> list[tuple[Tensor, Tensor]]:
     """Covariance of g at each scale, of variance 1 and mean 0: eigenvalues [V], falling, and eigenvectors [V, V]."""
     distance = torch.cdist(centers.double(), centers.double())
-    spacing, bases = distance.sort(dim=1).values[:, 1 : 1 + NEIGHBOURS].mean().clamp_min(1e-12), []
+    spacing = distance.sort(dim=1).values[:, 1 : 1 + NEIGHBOURS].mean().clamp_min(1e-12)
+    bases = []
     for scale in SCALES:
         covariance = torch.exp(-distance / (scale * spacing))
         covariance = covariance - covariance.mean(dim=0) - covariance.mean(dim=1, keepdim=True) + covariance.mean()
@@ -259,7 +266,8 @@ def _places(centers: Tensor) -> list[tuple[Tensor, Tensor]]:
 def _split(places: list[tuple[Tensor, Tensor]], precision: Tensor, seen: Tensor) -> tuple[float, Tensor, Tensor]:
     """Variance of s, covariance of d, patterns of g; likeliest brightness: precision [V, V] @ d = seen [V]."""
     count = len(seen)
-    eye, own_precision = torch.eye(count, dtype=torch.float64), precision.diagonal().clamp_min(1e-9)
+    eye = torch.eye(count, dtype=torch.float64)
+    own_precision = precision.diagonal().clamp_min(1e-9)
     brightness = torch.linalg.solve(precision + 1e-6 * own_precision.mean() * eye, seen)
     noise = float((1.0 / own_precision).median())
     best, highest = None, -math.inf

@@ -43,7 +43,8 @@ class Launcher:
             if kind is int:
                 ordinary = ordinary and -MAX_INT <= argument <= MAX_INT
             elif kind is not float:
-                kind, argument = None, argument.data_ptr()
+                kind = None
+                argument = argument.data_ptr()
                 ordinary = ordinary and argument % ALIGNMENT == 0
             kinds.append(kind)
             plain.append(argument)
@@ -55,5 +56,4 @@ class Launcher:
             return
         compiled = self.kernel[grid](*arguments, **constants)
         if compiled is not None and ordinary and KEEPS_CONSTANTS:  # the interpreter compiles nothing
-            names = self.kernel.arg_names[len(arguments) :]
-            self.variants[key] = compiled, tuple(constants[name] for name in names)
+            self.variants[key] = compiled, tuple(constants[name] for name in self.kernel.arg_names[len(arguments) :])

@@ -46,28 +46,11 @@ class ExportedModel(SplatfactoModel):
         stored = self.gauss_params.get(name)
         return self.means.new_zeros(self.num_points, *missing) if stored is None else stored
 
-    @property
-    def colors(self) -> Tensor:
-        return base_colors(self.features_dc)
-
-    @property
-    def opacities(self) -> Tensor:
-        return self._exported("opacities")
-
-    @property
-    def quats(self) -> Tensor:
-        return self._exported("quats")
-
-    @property
-    def features_dc(self) -> Tensor:
-        """The coefficients of the constant harmonic [N, 3]; of a head without them zeros, mid grey."""
-        return self._exported("features_dc", 3)
-
-    @property
-    def features_rest(self) -> Tensor:
-        """Coefficients of the higher harmonics [N, B, 3]; B = 0 for a head without any, unless they are fitted."""
-        return self._exported("features_rest", 0, 3)
-
-    @property
-    def shs_0(self) -> Tensor:
-        return self.features_dc
+    opacities = property(lambda self: self._exported("opacities"))
+    quats = property(lambda self: self._exported("quats"))
+    features_dc = property(lambda self: self._exported("features_dc", 3))
+    """coefficients of the constant harmonic [N, 3]; of a head without them zeros, mid grey"""
+    features_rest = property(lambda self: self._exported("features_rest", 0, 3))
+    """coefficients of the higher harmonics [N, B, 3]; B = 0 for a head without any, unless they are fitted"""
+    colors = property(lambda self: base_colors(self.features_dc))
+    shs_0 = property(lambda self: self.features_dc)

@@ -202,8 +202,7 @@ def fit_harmonics(model, cameras: Cameras) -> Fit:
         features_dc=plain.features_dc + delta[:, 0],
         features_rest=delta[:, 1:].contiguous(),
     )
-    unseen = int((moments.weight == 0).sum())
-    return Fit(plain, exact=False, strength=strength, views=len(cameras), unseen=unseen)
+    return Fit(plain, exact=False, strength=strength, views=len(cameras), unseen=int((moments.weight == 0).sum()))
 
 
 def choose_strength(kept: Moments, held_out: Moments) -> float:

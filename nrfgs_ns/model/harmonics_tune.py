@@ -43,7 +43,8 @@ def fine_tune(model, splats: PlainSplats, cameras: Cameras, steps: int | None = 
     if steps == 0:
         return splats
     tables = {name: getattr(splats, name).clone().requires_grad_() for name in RATES}
-    field, file = model.field.detached(), Field(ShConfig(degree=DEGREE).setup(), {**splats._asdict(), **tables})
+    field = model.field.detached()
+    file = Field(ShConfig(degree=DEGREE).setup(), {**splats._asdict(), **tables})
     background = model.background_color.to(model.device)
     generator = torch.Generator().manual_seed(0)
 

@@ -65,11 +65,12 @@ def start_with_dense_points(model: Any, datamanager: Any) -> None:
         model: an NrfgsModel.
         datamanager: with its images read.
     """
-    config, own = model.config, model.seed_points
-    share = share_kept(model.num_views) if config.dense_start == "auto" and not config.random_init else 0.0
+    own = model.seed_points
+    share = share_kept(model.num_views) if model.config.dense_start == "auto" and not model.config.random_init else 0.0
     if share == 0 or own is None:
         return
-    cameras, images = datamanager.train_dataset.cameras.to(model.device), datamanager.cached_train
+    cameras = datamanager.train_dataset.cameras.to(model.device)
+    images = datamanager.cached_train
     poses = world_to_camera(cameras.camera_to_worlds)
     intrinsics = cameras.get_intrinsics_matrices().to(poses)  # nerfstudio makes them on the CPU
     masks = [batch.get("mask") for batch in images]

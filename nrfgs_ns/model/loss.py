@@ -30,7 +30,8 @@ def loss_of(model, splats: Mapping[str, Tensor], outputs: Mapping[str, Any], bat
 
 def photometric(model, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> Tensor:
     """Splatfacto's loss of an image against its photograph, (1 - lambda) L1 + lambda (1 - SSIM), a scalar."""
-    truth, rgb = model.truth_of(batch, outputs["background"]), outputs["rgb"]
+    rgb = outputs["rgb"]
+    truth = model.truth_of(batch, outputs["background"])
     mask = None
     if "mask" in batch:  # pixels outside are black in both
         mask = model._downscale_if_required(batch["mask"]).to(model.device)

@@ -161,8 +161,8 @@ class NrfgsModel(ExportedModel):
             "depth" [H, W, 1].
         """
         field = self.field
-        view, look = self.project(camera, field.splats), self.look_of(self._photograph_of(camera))
-        outputs, self.info = self.render_view(view, self.noisy(field), look)
+        look = self.look_of(self._photograph_of(camera))
+        outputs, self.info = self.render_view(self.project(camera, field.splats), self.noisy(field), look)
         return outputs
 
     @property
@@ -183,7 +183,8 @@ class NrfgsModel(ExportedModel):
         """The camera for the rasterizer; training cameras whose pose is not learnt are converted once."""
         if not self.training:
             return self.pinholes.fixed(camera, self.device)
-        index, downscale = (camera.metadata or {}).get("cam_idx"), self._get_downscale_factor()
+        index = (camera.metadata or {}).get("cam_idx")
+        downscale = self._get_downscale_factor()
         if index is None or self.config.camera_optimizer.mode != "off":
             return pinhole(camera, self.camera_optimizer.apply_to_camera(camera), downscale)
         if (index, downscale) not in self._of_training:
@@ -218,8 +219,7 @@ class NrfgsModel(ExportedModel):
         if not name:
             return None
         if self.photograph is None:
-            finding = "this model has learnt no photograph's exposure: all renderings have one look"
-            warn(f"{LOOK} is {name!r}, but {finding}.")
+            warn(f"{LOOK} is {name!r}, but this model has learnt no photograph's exposure: renderings have one look.")
             return None
         names = self.photograph.names
         if name not in names:
@@ -243,7 +243,8 @@ class NrfgsModel(ExportedModel):
         appearance = noisy.seen_from(view)
         outputs, info = self.composite(view, appearance, look=look)
         if self.training:
-            shown, stored = appearance.opacities, noisy.splats["opacities"]
+            shown = appearance.opacities
+            stored = noisy.splats["opacities"]
             if view.every_row:
                 base = torch.sigmoid(stored).flatten()  # for splats that are not visible
                 shown = torch.where(info["radii"] > 0, shown, base)
@@ -295,13 +296,13 @@ class NrfgsModel(ExportedModel):
         self.view_noise = ViewNoise(self.noise_factor * camera_spacing(centers), self.view_noise.seed)
 
         steps = len(cameras) if self.config.warmup_steps is None else self.config.warmup_steps
-        before, after = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN_ITERATION
+        when = TrainingCallbackLocation
         callbacks = [
-            TrainingCallback([before], lambda step: warm_up(self, cameras, steps), iters=(0,)),
+            TrainingCallback([when.BEFORE_TRAIN_ITERATION], lambda step: warm_up(self, cameras, steps), iters=(0,)),
             *super().get_training_callbacks(attributes),
         ]
         if self.photograph is not None:
-            callbacks.append(TrainingCallback([after], lambda step: self.photograph.center_()))
+            callbacks.append(TrainingCallback([when.AFTER_TRAIN_ITERATION], lambda step: self.photograph.center_()))
         return callbacks
 
     def step_cb(self, optimizers, step: int) -> None:
@@ -352,8 +353,7 @@ class NrfgsModel(ExportedModel):
     @torch.no_grad()
     def get_metrics_dict(self, outputs, batch) -> dict[str, Any]:
         """PSNR inside the mask and the number of splats, for logs. Nothing waits for the GPU."""
-        truth = self.truth_of(batch, outputs["background"])
-        error = (outputs["rgb"] - truth).square().mean(dim=-1, keepdim=True)
+        error = (outputs["rgb"] - self.truth_of(batch, outputs["background"])).square().mean(dim=-1, keepdim=True)
         mask = self.mask_of(batch)
         mse = error.mean() if mask is None else (error * mask).sum() / mask.sum()
         metrics = {"psnr": -10.0 * torch.log10(mse), "gaussian_count": self.num_splats}
@@ -365,7 +365,8 @@ class NrfgsModel(ExportedModel):
 
         A metric without a value (LPIPS without its weights, MS-SSIM of a small image) is left out.
         """
-        rgb, truth = outputs["rgb"], self.truth_of(batch, outputs["background"])
+        rgb = outputs["rgb"]
+        truth = self.truth_of(batch, outputs["background"])
         metrics = image_metrics(rgb, truth, self.mask_of(batch)).items()
         return {name: value for name, value in metrics if value is not None}, {"img": torch.cat([truth, rgb], dim=1)}
 

@@ -96,8 +96,7 @@ class Pinhole(NamedTuple):
         (fx, _, cx), (_, fy, cy), _ = self.K[0]
         across = (torch.arange(self.width, device=x.device, dtype=x.dtype) + 0.5 - cx) / fx
         down = (torch.arange(self.height, device=x.device, dtype=x.dtype) + 0.5 - cy) / fy
-        rays = across[:, None] * x + down[:, None, None] * y + z
-        return normalize(rays, dim=-1)
+        return normalize(across[:, None] * x + down[:, None, None] * y + z, dim=-1)
 
 
 def world_to_camera(camera_to_world: Tensor) -> Tensor:

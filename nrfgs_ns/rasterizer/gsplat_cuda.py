@@ -100,8 +100,7 @@ def _packed_radii(radii: Tensor, conics: Tensor) -> Tensor:
 def _finite(rows: tuple) -> bool:
     """Whether the projected numbers are finite; False also if only their sum is not."""
     _, _, _, means2d, depths, conics, _, _ = rows
-    total = means2d.detach().sum() + depths.detach().sum() + conics.detach().sum()
-    return bool(torch.isfinite(total))
+    return bool(torch.isfinite(means2d.detach().sum() + depths.detach().sum() + conics.detach().sum()))
 
 
 def _visible_rows(geometry: tuple[Tensor, ...], cameras: tuple, options: ProjectionOptions) -> tuple:
@@ -132,7 +131,9 @@ def composite(
     Args:
         leave_out: do not draw rows that are not finite; only if `leaves_out` allows it.
     """
-    side, room, ours = TILE_SIZE, None, False
+    side = TILE_SIZE
+    room = None
+    ours = False
     if len(opacities) > 0 and _kernels_take(projection, opacities):
         from .tile_lists import room_on
 
@@ -175,8 +176,7 @@ def _our_image(
 
 def leaves_out(projection: Projection, colors: Tensor, opacities: Tensor) -> bool:
     """Whether `composite` can leave out rows that are not finite. Their gradients would not all be 0."""
-    few = colors.shape[-1] <= MOST_CHECKED
-    return few and not torch.is_grad_enabled() and _kernels_take(projection, opacities)
+    return colors.shape[-1] <= MOST_CHECKED and not torch.is_grad_enabled() and _kernels_take(projection, opacities)
 
 
 def _lists(
@@ -205,9 +205,9 @@ def _lists(
     images = {"n_cameras": projection.n_cameras, "camera_ids": projection.camera_ids}
     if HAS_BATCHES:
         images = {"n_images": projection.n_cameras, "image_ids": projection.camera_ids}
-    tables, tiles = (means2d, bounds, depths), (side, tile_width, tile_height)
+    tiles = side, tile_width, tile_height
     rows = {"gaussian_ids": projection.gaussian_ids, **images}
-    _, isect_ids, flatten_ids = isect_tiles(*tables, *tiles, packed=True, **rows)
+    _, isect_ids, flatten_ids = isect_tiles(means2d, bounds, depths, *tiles, packed=True, **rows)
     return isect_offset_encode(isect_ids, projection.n_cameras, tile_width, tile_height), flatten_ids
 
 
@@ -238,7 +238,8 @@ def _compositing_runs_on(device: torch.device) -> None:
     """Whether the kernels of `compositing_triton.py`, and that which splits lists, run on a device."""
     from .compositing_triton import CompositeSplats
 
-    lists, leaf = _lists_of_one(device, SMALL_TILE, split=True), torch.ones(1, 3, device=device, requires_grad=True)
+    lists = _lists_of_one(device, SMALL_TILE, split=True)
+    leaf = torch.ones(1, 3, device=device, requires_grad=True)
     for absgrad in (False, True):
         tables = leaf[:, :2].contiguous(), leaf * 1, leaf[:, 0].contiguous(), leaf * 1, torch.zeros_like(leaf)
         CompositeSplats.apply(*tables, *lists, (1, 1), absgrad)[0].sum().backward()

@@ -233,7 +233,8 @@ class Room:
     def was_enough(self) -> bool:
         """Whether there was room for all pairs; makes room for them and for the next image. Waits for the number."""
         self._arrived.synchronize()
-        pairs, room = int(self._counted[0]), self.pairs
+        room = self.pairs
+        pairs = int(self._counted[0])
         self.pairs = max(int(MORE * pairs), int(KEPT * room))
         return pairs <= room
 
@@ -257,7 +258,8 @@ class FixedRoom:
     @contextmanager
     def in_use(self) -> Iterator[None]:
         """Use this room for the images of this thread."""
-        rooms, device = _ROOMS.__dict__, self.counted.device
+        rooms = _ROOMS.__dict__
+        device = self.counted.device
         usual = rooms.get(device)
         rooms[device] = self
         try:
@@ -328,10 +330,12 @@ def tile_lists(
         )  # fmt: skip
     tiles, by_tile = torch.sort(tiles, stable=True)
     numbers = torch.arange(FIRST.value, FIRST.value + width * (height + 1), dtype=torch.int16, device=device)
-    begins, rows = torch.searchsorted(tiles, numbers, out_int32=True), rows.index_select(0, by_tile)
+    begins = torch.searchsorted(tiles, numbers, out_int32=True)
+    rows = rows.index_select(0, by_tile)
     if not split:
         return begins.view(1, height + 1, width), rows
-    places, lists = rows.new_zeros(size[1] + 1, size[0]), rows.new_empty(4 * pairs)
+    places = rows.new_zeros(size[1] + 1, size[0])
+    lists = rows.new_empty(4 * pairs)
     launch_split((width, height, 1), begins, rows, places, lists, *size, BATCH=BATCH, COUNT=True, num_warps=2)
     places = places.flatten().cumsum(0, dtype=torch.int32).view(1, *places.shape)
     launch_split((width, height, 1), begins, rows, places, lists, *size, BATCH=BATCH, COUNT=False, num_warps=2)

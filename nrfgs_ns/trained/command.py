@@ -23,7 +23,8 @@ class Eval(NamesTraining):
     """folder for the pictures, truth and rendering side by side"""
 
     def main(self) -> None:
-        path, pictures = self.config(), self.render_output_path
+        path = self.config()
+        pictures = self.render_output_path
         check_writable(self.output_path, "--output-path")
         if pictures is not None:
             check_writable(pictures / "eval.png", "--render-output-path")
@@ -72,7 +73,8 @@ class View(NamesTraining):
             threads.suit_to(trained.pipeline)
             # Nerfstudio looks here for the config.yml that its command for ns-render names; it writes nothing.
             config.relative_log_filename = str(path.absolute().parent / "viewer.log")
-            trained.config.vis, trained.config.viewer = "viewer", config
+            trained.config.vis = "viewer"
+            trained.config.viewer = config
             _start_viewer(trained.config, trained.pipeline, trained.step)
 
 
@@ -95,8 +97,7 @@ def view_file(path: Path, config):
 
     means = model.means.detach()
     middle = means.median(dim=0).values
-    spread = (means - middle).norm(dim=-1).median()
-    stand = middle + spread * means.new_tensor((2.0, -2.0, 1.0))  # z is up
+    stand = middle + (means - middle).norm(dim=-1).median() * means.new_tensor((2.0, -2.0, 1.0))  # z is up
     position, target = ((VISER_NERFSTUDIO_SCALE_RATIO * point).cpu().numpy() for point in (stand, middle))
 
     def welcome(client) -> None:

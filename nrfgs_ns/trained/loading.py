@@ -46,10 +46,7 @@ def load_training(path: Path, mode: Literal["test", "inference"]) -> Trained:
     places = [path.parent / config.relative_model_dir, config.get_checkpoint_dir()]
     folder = next((place for place in places if find(place)), None)
     if folder is None:
-        raise InputError(
-            f"{path}: no checkpoints beside it ({places[0]}), nor where it was trained ({places[1]}). Put the "
-            f"training's {config.relative_model_dir} beside it."
-        )
+        raise InputError(f"{path}: no checkpoints in {places[0]}, nor in {places[1]}. Put them into the first.")
     find_data(config, path)
     pipeline = config.pipeline.setup(device="cuda" if torch.cuda.is_available() else "cpu", test_mode=mode)
     pipeline.eval()
@@ -65,14 +62,13 @@ def find_data(config: "TrainerConfig", path: Path) -> None:
     stored = manager.data or manager.dataparser.data
     if stored is None or stored.exists():
         return
-    begin, now = config.output_dir.absolute(), path.absolute().parents[3:4]  # outputs/EXPERIMENT/METHOD/TIME/config.yml
+    begin = config.output_dir.absolute()
+    now = path.absolute().parents[3:4]  # outputs/EXPERIMENT/METHOD/TIME/config.yml
     places = [(folder / os.path.relpath(stored.absolute(), begin)).resolve() for folder in now if folder != begin]
     place = next((place for place in places if place.exists()), None)
     if place is None:
         tried = "".join(f", nor at {place}" for place in places)
-        raise InputError(
-            f"{path}: its data set is not at {stored}{tried}. Put it there, or change both `data` in the file."
-        )
+        raise InputError(f"{path}: its data set is not at {stored}{tried}. Put it there, or change both `data` in it.")
     config.data = manager.data = manager.dataparser.data = place
 
 
@@ -96,8 +92,8 @@ def load_file(path: Path) -> "NrfgsModel":
 
     decoded = decode(path)
     means = decoded.splats["means"]
-    mode, background, _ = decoded.render
-    name = {(0, 0, 0): "black", (1, 1, 1): "white"}.get(background, "random")
+    mode, background = (decoded.header["render"][name] for name in ("rasterize_mode", "background"))
+    name = {(0, 0, 0): "black", (1, 1, 1): "white"}.get(tuple(background), "random")
     config = NrfgsModelConfig(appearance=decoded.config, rasterize_mode=mode, background_color=name, near_plane="auto")
     model = config.setup(
         scene_box=SceneBox(torch.stack([means.amin(0), means.amax(0)])),
@@ -126,11 +122,13 @@ def measure_loss(pipeline, pictures: Callable[[Any], dict[str, Tensor]]) -> dict
 
     model, data = pipeline.model, pipeline.datamanager
     names = picture_names(data.eval_dataset.image_filenames)
-    per_image, scores = [], {}
+    per_image = []
+    scores = {}
     with progress("Measuring the loss", len(names)) as advance:
         for image, (camera, batch) in zip(names, data.fixed_indices_eval_dataloader, strict=True):
             outputs = model.get_outputs_for_camera(camera)
-            truth, mask = model.truth_of(batch, outputs["background"]), model.mask_of(batch)
+            truth = model.truth_of(batch, outputs["background"])
+            mask = model.mask_of(batch)
             rendered = {"model": outputs["rgb"], **pictures(camera)}
             scores = {f"psnr_{name}": psnr(picture, truth, mask) for name, picture in rendered.items()}
             if None not in scores.values():  # None: no pixel inside the mask
@@ -152,7 +150,8 @@ def finish(lines: Iterable[str], numbers: dict[str, Any], report: Path | None) -
 
 def lost(numbers: dict[str, Any]) -> str:
     """`measure_loss` in a sentence."""
-    count, loss = len(numbers["per_image"]), numbers["loss_db"]
+    count = len(numbers["per_image"])
+    loss = numbers["loss_db"]
     views = "one test view" if count == 1 else f"{count} test views"
     change = f"{abs(loss):.2f} dB {'lost' if loss > 0 else 'gained'}" if abs(loss) >= 0.005 else "nothing lost"
     return f"PSNR on {views}: model {numbers['psnr_model']:.2f} dB, file {numbers['psnr_file']:.2f} dB ({change})."

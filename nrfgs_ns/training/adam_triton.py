@@ -143,7 +143,8 @@ class AdamTable:
             self.copied.synchronize()  # the copy of the step before, which has long been made
         if not aligned or (fixed != self.fixed and not self._write_fixed(work, fixed)):
             return False
-        count, base = len(gradients), work[0][1][0]
+        base = work[0][1][0]
+        count = len(gradients)
         self.numbers[CONSTANTS, :count] = np.array(constants).T
         self.rows[GRADIENT, :count] = (np.array(gradients) - base.data_ptr()) >> 2
         self.device.copy_(self.host, non_blocking=True)
@@ -174,12 +175,14 @@ class AdamTable:
         ):
             return False
         each = np.array(fixed).reshape(-1, 5).T
-        count, programs = each.shape[1], -(-each[4] // BLOCK)
+        count = each.shape[1]
+        programs = -(-each[4] // BLOCK)
         self.rows[END, :count] = np.cumsum(programs)
         self.rows[END, count:] = np.iinfo(np.int64).max
         self.rows[SIZE, :count] = each[4]
         self.rows[FIXED, :count] = (each[:4] - each[0, 0]) >> 2
-        self.fixed, self.programs = fixed, int(programs.sum())
+        self.fixed = fixed
+        self.programs = int(programs.sum())
         return True
 
 

@@ -50,7 +50,8 @@ class ParameterMean:
         if not self.is_current(optimizers):
             parameters = _parameters(optimizers)
             self._means = {name: torch.zeros_like(parameter) for name, parameter in parameters.items()}
-            self._parameters, self.count = parameters, 0
+            self._parameters = parameters
+            self.count = 0
         self.count += 1
         torch._foreach_lerp_(list(self._means.values()), list(self._parameters.values()), 1.0 / self.count)
 

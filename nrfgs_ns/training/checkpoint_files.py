@@ -64,7 +64,8 @@ def write(folder: Path, step: int, content: dict[str, Any], only_latest: bool = 
         if isinstance(error, torch.OutOfMemoryError):
             raise
         reason = getattr(error, "strerror", None) or "the disk is full or a limit reached"
-        free, kept = shutil.disk_usage(folder).free / 1e6, next(iter(find(folder).values()), "none")
+        free = shutil.disk_usage(folder).free / 1e6
+        kept = next(iter(find(folder).values()), "none")
         raise DiskFull(
             f"{folder}: the checkpoint of step {step} cannot be written: {reason}. {free:,.0f} MB are free. The last "
             f"one: {kept}. Make room, or lift the quota or the limit on file sizes (ulimit -f)."

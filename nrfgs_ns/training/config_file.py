@@ -77,7 +77,8 @@ def check_types(config: Any, source: str, prefix: str = "") -> None:
         return
     hints = get_type_hints(type(config))
     for field in fields(config):
-        value, name, hint = getattr(config, field.name), f"{prefix}{field.name}", hints[field.name]
+        value, hint = getattr(config, field.name), hints[field.name]
+        name = f"{prefix}{field.name}"
         if field.name.startswith("_") or (not is_dataclass(value) and value == _default(field)):
             continue
         if not _is_a(value, hint):

@@ -163,7 +163,8 @@ class Guard:
         pairs = zip(verdict.watched, self._read(verdict), strict=True)
         bad = [(each, size) for each, size in pairs if not size <= MAX_GRADIENT]
         if bad:
-            step, findings = verdict.step, [(each.name, size, each.tensor) for each, size in bad]
+            step = verdict.step
+            findings = [(each.name, size, each.tensor) for each, size in bad]
             message = report(self.pipeline, step, findings, MAX_GRADIENT)
             message += f"\nThe update of step {step} was not made. The state before it is in that step's checkpoint; "
             raise TrainingStopped(f"{message}with --load-dir, training goes on from there.", step, bad[0][0].origin)
@@ -201,7 +202,8 @@ class Guard:
 
 def report(pipeline, step: int, findings: Findings, limit: float) -> str:
     """The message of a stop: the first tensor, its splats, and the likely cause."""
-    model, (first, size, _) = pipeline.model, findings[0]
+    model = pipeline.model
+    first, size, _ = findings[0]
     what = "has NaN" if math.isnan(size) else "is infinite"
     if math.isfinite(size):
         what = f"reaches {size:.2g}, which Adam cannot square"

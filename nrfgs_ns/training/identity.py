@@ -54,7 +54,7 @@ def check_data_set(written: Mapping[str, Any], here: Mapping[str, Any], data: ob
         differ = sorted(set(written["images"]) ^ set(here["images"]))
         what = some(differ) if differ else "in other numbers, or in another order"
         raise InputError(f"{data}: the checkpoint was trained on other images ({what}). {fix}")
-    centers, now = written["centers"].double(), here["centers"].double()
+    centers, now = (scene["centers"].double() for scene in (written, here))
     extent = float((centers.amax(0) - centers.amin(0)).max())
     if written["images"] != here["images"]:
         known = dict(zip(written["images"], centers, strict=True))
@@ -70,10 +70,7 @@ def check_options(written: Mapping[str, str], here: Mapping[str, str]) -> None:
     changed = [name for name in written if name in here and written[name] != here[name]]
     if changed:
         was = (f"--{name.replace('_', '-')} was {written[name]} and is {here[name]}" for name in changed[:3])
-        raise InputError(
-            "The checkpoint's training had other options, without which its numbers mean something else: "
-            f"{'; '.join(was)}. Give the same ones, or train anew."
-        )
+        raise InputError(f"The checkpoint had other options: {'; '.join(was)}. Give the same ones, or train anew.")
 
 
 def leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:

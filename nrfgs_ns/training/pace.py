@@ -19,7 +19,6 @@ in steps.
 
 import math
 from collections import deque
-from collections.abc import Callable
 from statistics import median
 from time import perf_counter
 from typing import Any
@@ -38,7 +37,6 @@ STEPS_IN_MEDIAN = 51
 """Steps in the median that estimates a step's duration, so that evaluations and checkpoints in between do not count."""
 
 Phases = list[tuple[float, float]]
-Clock = Callable[[], float]
 
 
 def steps_for(views: int) -> int:
@@ -90,7 +88,7 @@ class TimedPace(Pace):
         clock: seconds, for tests.
     """
 
-    def __init__(self, length: int, seconds: float, phases: Phases | None = None, clock: Clock = perf_counter):
+    def __init__(self, length: int, seconds: float, phases: Phases | None = None, clock=perf_counter):
         super().__init__(length)
         self.seconds = seconds
         self.phases = phases or [(math.inf, 1.0)]
@@ -124,7 +122,8 @@ class TimedPace(Pace):
         return math.ceil((self.length - self.position) / self.rate)
 
     def start(self) -> None:
-        self._started, self._begun = self.clock(), None
+        self._started = self.clock()
+        self._begun = None
 
     def begin_step(self) -> None:
         now = self.clock()
@@ -137,7 +136,9 @@ class TimedPace(Pace):
             step = self.step_seconds
             # The schedules' last position is for the last step, not for one behind it.
             left = max(self.seconds - self.elapsed, step)
-            work, begin, present = 0.0, self.position, None  # at rate 1, in steps of the present cost
+            work = 0.0  # at rate 1, in steps of the present cost
+            begin = self.position
+            present = None
             for end, cost in self.phases:
                 end = min(end, float(self.length))
                 if end > begin:

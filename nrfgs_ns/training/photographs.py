@@ -50,7 +50,8 @@ def photograph_model(config: Any, datamanager: Any) -> PhotographModel | None:
     choice = config.photographs
     if choice == "off":
         return None
-    dataset, metadata = datamanager.train_dataset, datamanager.train_dataparser_outputs.metadata
+    dataset = datamanager.train_dataset
+    metadata = datamanager.train_dataparser_outputs.metadata
     exif = exposures(exif_of(dataset.image_filenames, metadata.get("exif")))
     pairs = compare_photographs(metadata.get("points3D_xyz"), dataset.cameras, datamanager.cached_train)
     centers = dataset.cameras.camera_to_worlds[:, :3, 3].cpu()
@@ -75,10 +76,7 @@ def check_same_photographs(own: PhotographModel | None, written: Mapping[str, An
     the other way round. That the photographs are the same is checked before (`identity.check_data_set`)."""
     if (own is None) != (written is None):
         theirs, ours = ("on", "off") if own is None else ("off", "on")
-        raise InputError(
-            f"The checkpoint was trained with photographs {theirs}, this training has them {ours}. Set "
-            f"--pipeline.model.photographs {theirs}, or train anew."
-        )
+        raise InputError(f"The checkpoint had --pipeline.model.photographs {theirs}, not {ours}. Set it or train anew.")
 
 
 def exif_of(paths: Sequence[Path], stored: Sequence[Exif] | None) -> list[Exif]:
@@ -114,9 +112,11 @@ def compare_photographs(points: Tensor | None, cameras: Cameras, images: Sequenc
     points = overlap.drawn(points)
 
     def seen(viewmat: Tensor, K: Tensor, batch: Mapping[str, Any]) -> overlap.Sighting:
-        image, mask = batch["image"], None
+        image = batch["image"]
+        mask = None
         if image.shape[-1] == 4:
-            mask, image = image[..., 3] >= (128 if image.dtype == torch.uint8 else 0.5), image[..., :3]
+            mask = image[..., 3] >= (128 if image.dtype == torch.uint8 else 0.5)
+            image = image[..., :3]
         if "mask" in batch:
             inside = batch["mask"][..., 0] >= 0.5
             mask = inside if mask is None else mask & inside.to(mask.device)

@@ -103,7 +103,8 @@ class NrfgsPipeline(VanillaPipeline):
     @property
     def cameras_to_fit(self) -> Cameras:
         """The training cameras in the size of the training, also where nerfstudio gives them the photographs'."""
-        cameras, parser = deepcopy(self.datamanager.train_dataset.cameras), self.datamanager.dataparser
+        cameras = deepcopy(self.datamanager.train_dataset.cameras)
+        parser = self.datamanager.dataparser
         if self.test_mode == "inference" and hasattr(type(parser), "downscale_factor"):  # which nerfstudio has set to 1
             factor = getattr(parser, "training_factor", parser.config.downscale_factor)
             cameras.rescale_output_resolution(1 / (factor or 1))
@@ -111,13 +112,11 @@ class NrfgsPipeline(VanillaPipeline):
 
     def _check_smallest_image(self) -> None:
         """Raise InputError where a training's first images are too small for SSIM."""
-        cameras, factor = self.datamanager.train_dataset.cameras, 2**self.config.model.num_downscales
+        cameras = self.datamanager.train_dataset.cameras
+        factor = 2**self.config.model.num_downscales
         width, height = (int(side.min()) // factor for side in (cameras.width, cameras.height))
         if min(width, height) < SMALLEST_SIDE:
-            raise InputError(
-                f"{self.datamanager.get_datapath()}: training would begin with images of {width} x {height} pixels. "
-                "Give a smaller --pipeline.model.num-downscales, or larger images."
-            )
+            raise InputError(f"Training begins at {width} x {height} pixels: lower --pipeline.model.num-downscales.")
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint, or the compact file that the configuration names; InputError if it does not fit.
@@ -235,7 +234,8 @@ def kernels_of(head: AppearanceHead) -> tuple[Callable[[torch.device], object], 
 
 def print_evaluation(result: Mapping[str, Any]) -> None:
     """Print the means over the test views, the worst view, and how to get LPIPS where it is missing."""
-    names, views = [name for name in SHOWN if result.get(name) is not None], result["per_image"]
+    names = [name for name in SHOWN if result.get(name) is not None]
+    views = result["per_image"]
     known = sorted((view["psnr"], view["image"]) for view in views if view.get("psnr") is not None)
     title = "One test view: not a mean, and no measure of the whole"
     CONSOLE.print(title if len(known) == 1 else f"Means over {len(known)} test views", soft_wrap=True)
@@ -245,8 +245,9 @@ def print_evaluation(result: Mapping[str, Any]) -> None:
     if masked := [view["image"] for view in views if view.get("psnr") is None]:
         warn(f"Masks leave nothing to measure of {some(masked)}.")
     if len(known) > 1:
-        (worst, name), middle = known[0], median(value for value, _ in known)
-        worst = f"Median view {middle:.1f} dB. Worst {worst:.1f} dB: {name}. Pictures: --render-output-path FOLDER"
-        CONSOLE.print(worst, markup=False, soft_wrap=True)
+        worst, name = known[0]
+        middle = median(value for value, _ in known)
+        line = f"Median view {middle:.1f} dB. Worst {worst:.1f} dB: {name}. Pictures: --render-output-path FOLDER"
+        CONSOLE.print(line, markup=False, soft_wrap=True)
     if result.get("lpips") is None and (advice := lpips_advice()) is not None:
         CONSOLE.print(advice, markup=False, soft_wrap=True)

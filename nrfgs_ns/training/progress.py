@@ -76,7 +76,8 @@ class ProgressLine(LocalWriter):
         data = pipeline.datamanager
         views = data.eval_dataset.image_filenames
         if views:
-            self._pipeline, self._lock, self._view = pipeline, lock, len(views) // 2
+            self._pipeline, self._lock = pipeline, lock
+            self._view = len(views) // 2
             name = views[self._view]
             kind = "training" if name in data.train_dataset.image_filenames else "test"
             self._view_name = f"{kind} view {name.name}"
@@ -107,7 +108,8 @@ class ProgressLine(LocalWriter):
             self._live = None
 
     def _update(self, step: int, is_last: bool = False) -> None:
-        start, total = perf_counter(), max(writer.GLOBAL_BUFFER["max_iter"], step + 1)
+        start = perf_counter()
+        total = max(writer.GLOBAL_BUFFER["max_iter"], step + 1)
         done = (step + 1) / total
         parts = [f"step {step + 1:,} of {total:,} ({100 * done:.0f} %)"]
         if self._pipeline is not None:
@@ -141,7 +143,8 @@ def psnr_of(pipeline: Any, index: int) -> float | None:
     model, data = pipeline.model, pipeline.datamanager
     pipeline.eval()
     try:
-        camera, batch = data.eval_dataset.cameras[index : index + 1].to(model.device), data.cached_eval[index]
+        camera = data.eval_dataset.cameras[index : index + 1].to(model.device)
+        batch = data.cached_eval[index]
         outputs = model.get_outputs_for_camera(camera)
         return psnr(outputs["rgb"], model.truth_of(batch, outputs["background"]), model.mask_of(batch))
     finally:

@@ -69,9 +69,7 @@ class StepGraphs:
         if (obstacle := self._obstacle(batch)) is not None:
             self._is_new()  # graphs of splats that are gone would keep their memory
             if obstacle not in self._said:
-                CONSOLE.print(
-                    f"Steps are not recorded as a CUDA graph, so they take longer: {obstacle}.", soft_wrap=True
-                )
+                CONSOLE.print(f"Steps are not recorded as a CUDA graph, and take longer: {obstacle}.", soft_wrap=True)
                 self._said.add(obstacle)
             return False
         # Smaller images go to pytorch_msssim, which copies its window from the host.
@@ -103,7 +101,8 @@ class StepGraphs:
             self.guard.settle()
             return False
         seen_from = self.model.pinhole(camera)
-        now, kind = (seen_from, batch, camera.metadata["cam_idx"], step), _kind(batch)
+        now = seen_from, batch, camera.metadata["cam_idx"], step
+        kind = _kind(batch)
         if (graph := self._graphs.get(kind)) is not None:
             graph.prepare(*now)
         self.guard.settle()  # everything is ready, so that the GPU need not wait for what the host does
@@ -114,7 +113,8 @@ class StepGraphs:
     def run(self, batch: Mapping[str, Any]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """The outputs and losses of the step that has been prepared, detached: the parameters have the gradients of the
         losses' sum."""
-        model, graph = self.model, self._graphs[_kind(batch)]
+        model = self.model
+        graph = self._graphs[_kind(batch)]
         losses = graph.run()
         model.info = {**graph.info, "pairs": graph.last_pairs}
         model.watch(graph.outputs, losses, batch)
@@ -174,8 +174,10 @@ class StepGraphs:
         makes the lists, not `tile_lists.py`."""
         from nrfgs_ns.rasterizer.tile_lists import FixedRoom
 
-        model, count = self.model, len(self.datamanager.train_dataset)
-        field, room = model.field, FixedRoom(1, model.device)
+        model = self.model
+        field = model.field
+        room = FixedRoom(1, model.device)
+        count = len(self.datamanager.train_dataset)
         for index in range(0, count, max(count // VIEWS_ASKED, 1)):
             camera, _ = self.datamanager.train_view(index)
             view = model.project(camera, field.splats)
@@ -229,7 +231,8 @@ class _StepGraph:
         self.graph = torch.cuda.CUDAGraph()
         if self.noise is not None:
             self.graph.register_generator_state(self.noise)
-        now, (pool, aside) = torch.cuda.current_stream(device), place
+        pool, aside = place
+        now = torch.cuda.current_stream(device)
         residuals = None if model.trimming is None else model.trimming.histogram.clone()
         aside.wait_stream(now)
         try:
@@ -298,8 +301,8 @@ class _StepGraph:
 
     def prepare(self, seen_from: Pinhole, batch: Mapping[str, Any], index: int, step: int) -> None:
         """Copy in a step's camera, noise and training photograph, number `index`."""
-        mine, now = self.seen_from, seen_from
-        torch._foreach_copy_([mine.viewmat, mine.K, mine.center], [now.viewmat, now.K, now.center])
+        mine = self.seen_from
+        torch._foreach_copy_([mine.viewmat, mine.K, mine.center], [seen_from.viewmat, seen_from.K, seen_from.center])
         for name, values in self.batch.items():
             values.copy_(batch[name], non_blocking=True)
         self.model.view_noise.generator(self.device, step)  # the same, with this step's seed

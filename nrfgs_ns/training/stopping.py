@@ -40,7 +40,8 @@ class StopRequest:
         if self.is_over:
             raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(128 + number)
         if self.signal is None:
-            self.signal, self._heard_at = signal.Signals(number), monotonic()
+            self.signal = signal.Signals(number)
+            self._heard_at = monotonic()
             if self.signal.name == "SIGHUP":
                 _let_go_of_terminal()
             elif not self.quiet:

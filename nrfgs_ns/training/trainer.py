@@ -113,7 +113,8 @@ class NrfgsTrainer(Trainer):
         self.guard = Guard(self.pipeline)
         self.mean = ParameterMean() if self.config.average_steps > 0 else None
         self.pace = self.config.pace()
-        groups, every = self.pipeline.get_param_groups(), self.config.logging.steps_per_log
+        groups = self.pipeline.get_param_groups()
+        every = self.config.logging.steps_per_log
         return LeanOptimizers(self.optimizer_configs(), groups, every, self.pace)
 
     # Resuming.
@@ -178,7 +179,8 @@ class NrfgsTrainer(Trainer):
 
     def optimizer_configs(self) -> dict[str, Any]:
         """The configured optimisers; the means' learning rates, lengths in scene units, in world units."""
-        unit, means = self.pipeline.model.scene_unit, self.config.optimizers["means"]
+        unit = self.pipeline.model.scene_unit
+        means = self.config.optimizers["means"]
         optimizer, scheduler = means["optimizer"], means["scheduler"]
         if scheduler is not None:
             rates = {name: value for name, value in vars(scheduler).items() if name in ("lr_final", "lr_pre_warmup")}
@@ -260,7 +262,8 @@ class NrfgsTrainer(Trainer):
 
     def _average(self, step: int) -> None:
         """Add the step's parameters to the mean if it is one of the last `average_steps` (see `averaging.window`)."""
-        mean, timed = self.mean, isinstance(self.pace, TimedPace)
+        mean = self.mean
+        timed = isinstance(self.pace, TimedPace)
         left = self.pace.steps_left if timed else self.last_step - step  # timed: an estimate
         size = window(self.config.average_steps, step + 1 + left)
         # A timed window stays once begun, unless the estimate was far off; otherwise the mean may be of steps that were
@@ -276,7 +279,8 @@ class NrfgsTrainer(Trainer):
 
     def _after_train(self) -> None:
         """Nerfstudio's, whose step number is one too high after an early stop. The mean becomes the model."""
-        self.step, self._is_ending = self._made, True
+        self.step = self._made
+        self._is_ending = True
         timed_out = isinstance(self.pace, TimedPace) and self.pace.is_spent
         if self._signal and not timed_out and self._made < self.last_step:
             outcome = NOTHING_TO_SAVE
@@ -321,7 +325,8 @@ class NrfgsTrainer(Trainer):
                 print(f"The training failed in step {self.step}. {self._save_last_step()}", flush=True)
                 raise
             error.__traceback__ = None  # its frames hold the step's tensors
-            outcome, what = self._save_last_step(), str(error).partition("\n")[0]
+            outcome = self._save_last_step()
+            what = str(error).partition("\n")[0]
             message = f"Out of memory in step {self.step}: {what}\n{outcome} Fewer splats or smaller images take less"
             savable = self._saved_step == self._made
             raise TrainingStopped(f"{message} (docs/troubleshooting.md).", self.step, "memory", savable) from None

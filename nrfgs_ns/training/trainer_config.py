@@ -55,10 +55,11 @@ class NrfgsTrainerConfig(TrainerConfig):
 
     def setup(self, **kwargs) -> Trainer:
         """The trainer, for several devices the one that spreads the splats over them; InputError as `check`."""
-        devices, steps = kwargs.get("world_size", 1), self.max_num_iterations or STEPS
+        devices = kwargs.get("world_size", 1)
         self.check(devices)
         if devices == 1:
             return super().setup(**kwargs)
+        steps = self.max_num_iterations or STEPS
         whole = replace(self, max_num_iterations=steps, average_steps=self.average_steps or 0)  # not stretched
         return resolve_name(f"{SEVERAL_DEVICES}.trainer:ShardedTrainer")(whole, **kwargs)
 
@@ -70,7 +71,8 @@ class NrfgsTrainerConfig(TrainerConfig):
         for name in ("mixed_precision", "use_grad_scaler", "gradient_accumulation_steps", "log_gradients"):
             if value := getattr(self, name):
                 raise InputError(f"{name} is {value}; these methods train without it. Leave it out.")
-        data, positive = self.pipeline.datamanager, math.ulp(0.0)
+        positive = math.ulp(0.0)
+        data = self.pipeline.datamanager
         if (order := data.train_cameras_sampling_strategy) != "random":
             name = "pipeline.datamanager.train_cameras_sampling_strategy"
             raise InputError(f"{name} is {order}; these methods draw cameras at random. Leave it out.")
@@ -87,7 +89,8 @@ class NrfgsTrainerConfig(TrainerConfig):
             ("machine.num_machines", self.machine.num_machines, 1),
         ]
         for group, parts in self.optimizers.items():
-            name, schedule = f"optimizers.{group}", parts["scheduler"]
+            name = f"optimizers.{group}"
+            schedule = parts["scheduler"]
             falls = isinstance(schedule, ExponentialDecaySchedulerConfig)  # which zero cannot
             limits.append((f"{name}.optimizer.lr", parts["optimizer"].lr, positive if falls else 0))
             if falls:
@@ -138,7 +141,8 @@ class NrfgsTrainerConfig(TrainerConfig):
         devices = self.machine.num_devices * self.machine.num_machines
         self.check(devices)
         datamanager = self.pipeline.datamanager
-        data, parser = self.data or datamanager.data, datamanager.dataparser
+        data = self.data or datamanager.data
+        parser = datamanager.dataparser
         is_here = not isinstance(parser, NrfgsDataParserConfig) or Path("transforms.json").exists()
         if data is None and parser.data == Path() and not is_here:
             fix = "Name the folder of the data set; `nrfgs prepare PHOTOS SCENE` makes one from photographs."
@@ -198,6 +202,7 @@ def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool)
         CONSOLE.print(f"Images are read at {size}, {width} x {height} (--downscale-factor: docs/own-data.md).", **PLAIN)
     is_long = config.time_budget is None and config.max_num_iterations >= FEWEST_STEPS
     if config.machine.device_type == "cpu" and is_long and config.pipeline.datamanager.camera_res_scale_factor == 1:
-        scale, words = round(LONGEST_SIDE / max(width, height), 2), "nrfgs-fast with --time-budget 10"
+        scale = round(LONGEST_SIDE / max(width, height), 2)
+        words = "nrfgs-fast with --time-budget 10"
         words += f" --pipeline.datamanager.camera-res-scale-factor {scale:.2g}" * (scale < 1)
         CONSOLE.print(f"No CUDA device: the CPU trains. A result in ten minutes: {words}", **PLAIN)

@@ -9,7 +9,6 @@ import contextlib
 import sys
 import threading
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -23,9 +22,6 @@ from viser.transforms import SO3
 from nrfgs_ns.viewer.pictures import FULL, PictureOptions, legends, picture
 from nrfgs_ns.viewer.server import protect
 from nrfgs_ns.viewer.start import open_sooner
-
-if TYPE_CHECKING:
-    from nrfgs_ns.model.model import NrfgsModel
 
 STEP_FORWARD = 5.0
 """Distance of a browser's first view in front of the first photograph, in sizes of the frustums that mark photographs.
@@ -50,7 +46,7 @@ def uninterrupted() -> Iterator[None]:
 class ViewerPanel(ViewerControl):
     """The folder "Appearance" at the top of nerfstudio's viewer, which finds it as an attribute of the model."""
 
-    def __init__(self, model: "NrfgsModel"):
+    def __init__(self, model):
         protect()
         open_sooner()
         self.model = model
@@ -72,8 +68,8 @@ class ViewerPanel(ViewerControl):
             self.stops = gui.add_slider("Exposure", -3.0, 3.0, 0.1, 0.0, hint="Stops by which the image is brighter")
             self.look = None
             if self.model.photograph is not None:
-                names, hint = [MEAN_LOOK, *self.model.photograph.names], "The photograph whose exposure is shown"
-                self.look = gui.add_dropdown("Look", names, MEAN_LOOK, hint=hint)
+                names = [MEAN_LOOK, *self.model.photograph.names]
+                self.look = gui.add_dropdown("Look", names, MEAN_LOOK, hint="The photograph whose exposure is shown")
             hint = "Keep the appearance that the splats have from here, and walk around them"
             self.freeze = gui.add_checkbox("Freeze view", initial_value=False, hint=hint)
             self.count = gui.add_text("Splats", initial_value=f"{self.model.num_points:,}", disabled=True)
@@ -144,7 +140,8 @@ class ViewerPanel(ViewerControl):
             self.marker.remove()
             self.marker = None
         if self.freeze.value and client is not None:
-            camera, size = client.camera, self.viewer.config.camera_frustum_scale
+            camera = client.camera
+            size = self.viewer.config.camera_frustum_scale
             self.frozen_center = torch.tensor(camera.position / VISER_NERFSTUDIO_SCALE_RATIO, dtype=torch.float32)
             place = {"wxyz": camera.wxyz, "position": camera.position}
             self.marker = self.viser_server.scene.add_camera_frustum(

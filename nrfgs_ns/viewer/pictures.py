@@ -12,7 +12,6 @@ Changes of colour or opacity are drawn around grey, AMPLIFICATION times as large
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -22,9 +21,6 @@ from torch import Tensor
 from nrfgs_ns.appearance.head import Field, SplatAppearance
 from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.rasterizer import View, composite
-
-if TYPE_CHECKING:
-    from nrfgs_ns.model.model import NrfgsModel
 
 FULL, BASE, VIEW_DEPENDENCE, DEPTH = "full", "base colour", "view dependence", "depth"
 
@@ -81,12 +77,11 @@ def legends(field: Field) -> dict[str, str]:
 
 
 @torch.no_grad()
-def picture(
-    model: "NrfgsModel", camera: Cameras, options: PictureOptions, background: Tensor | None = None
-) -> dict[str, Tensor]:
-    """Render one camera, a batch of [1], in one mode, with a model in evaluation mode.
+def picture(model, camera: Cameras, options: PictureOptions, background: Tensor | None = None) -> dict[str, Tensor]:
+    """Render one camera, a batch of [1], in one mode.
 
     Args:
+        model: an NrfgsModel in evaluation mode.
         background: a colour [3] behind the splats instead of the configuration's.
 
     Returns:

@@ -61,10 +61,7 @@ def protect() -> None:
         return
     version = importlib.metadata.version("viser")
     if version != VISER:
-        raise InputError(
-            f"viser {version} is installed, and the viewer is guarded in {VISER} alone. Run: pip install viser=="
-            f"{VISER}."
-        )
+        raise InputError(f"viser {version}: the viewer is guarded in {VISER} alone. Run: pip install viser=={VISER}.")
     infra.WebsockServer = GuardedServer
     # The page is built. To ask, viser looks through all processes of the machine, and fails if one of them ends then.
     _client_autobuild.ensure_client_is_built = lambda: None
@@ -89,16 +86,17 @@ def _open_guarded(open_viewer: Callable[..., None], viewer: Viewer, config, *arg
     open_viewer(viewer, config, *args, **options)
     if viewer.trainer is None:
         _hide_pause(viewer)
-    server, tunnel = viewer.viser_server, viewer.viser_server._share_tunnel
+    server = viewer.viser_server
+    tunnel = server._share_tunnel
     if tunnel is not None and tunnel.get_url():
         server._websock_server.names.add(urlsplit(tunnel.get_url()).hostname)
-    port, machine = server.get_port(), socket.gethostname()
+    port = server.get_port()
     wanted = config.websocket_port or config.websocket_port_default
     if port != wanted:
         viewer.viewer_info = [line.replace(f":{wanted}", f":{port}") for line in viewer.viewer_info]
         viewer.viewer_info.append(f"Port {wanted} is busy; the viewer is at {port}.")
     if config.websocket_host in (LOCAL, "localhost"):
-        viewer.viewer_info.append(f"From another machine: ssh -L {port}:localhost:{port} {machine}")
+        viewer.viewer_info.append(f"From another machine: ssh -L {port}:localhost:{port} {socket.gethostname()}")
     else:
         viewer.viewer_info.append(f"Whoever reaches {config.websocket_host} can look, and steer the training.")
 
@@ -132,9 +130,7 @@ def _check_address(host: str, port: int | None) -> None:
         with socket.socket(family, kind) as trial:
             trial.bind(address)
     except (OSError, UnicodeError) as error:
-        raise InputError(
-            f"The viewer cannot listen on {host!r} ({error}). Give 127.0.0.1, 0.0.0.0 or an address of this machine."
-        ) from error
+        raise InputError(f"The viewer cannot listen on {host!r} ({error}). Give an address of this machine.") from error
 
 
 def _refused(*_, **__):
@@ -230,7 +226,8 @@ class GuardedServer(infra.WebsockServer):
             pose = np.array([*message.wxyz, *message.position], np.float32)
             if len(pose) != 7 or not np.isfinite(pose).all() or not pose[:4].any():
                 raise ValueError("no pose, on which a GPU's kernels may fail")
-            message.aspect, message.fov = _clamped(message.aspect, 1 / WIDEST, WIDEST), _clamped(message.fov, *LENS)
+            message.aspect = _clamped(message.aspect, 1 / WIDEST, WIDEST)
+            message.fov = _clamped(message.fov, *LENS)
         elif isinstance(message, _messages.GuiUpdateMessage):
             value = message.updates["value"]
             if message.id in self.file_names:

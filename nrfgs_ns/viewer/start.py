@@ -57,7 +57,8 @@ class SmallPhotographs:
 
     def __init__(self, dataset: InputDataset, read: Sequence[Mapping[str, Any]] | None):
         self.cameras = dataset.cameras
-        self._paths, self._read = dataset.image_filenames, read
+        self._paths = dataset.image_filenames
+        self._read = read
 
     def __len__(self) -> int:
         return len(self._paths)

@@ -72,8 +72,7 @@ def test_colours_and_gradients_are_those_of_the_twin(degree, splats, highest):
     for function in (eval_sh, Harmonics.apply):
         leaves = [table.clone().requires_grad_() for table in (directions, coefficients)]
         colors = function(degree, *leaves) + 0.0 * leaves[0]  # without it the twin's degree 0 has no gradient
-        gradients = torch.autograd.grad(colors, leaves, upstream)
-        results.append((colors.detach(), *gradients))
+        results.append((colors.detach(), *torch.autograd.grad(colors, leaves, upstream)))
     (twin, twin_d, twin_k), (colors, d, k) = results
     assert_close(colors, twin, rtol=1e-5, atol=1e-5)
     assert_close(k, twin_k, rtol=1e-5, atol=1e-5)

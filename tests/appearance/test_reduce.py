@@ -48,8 +48,7 @@ def test_components_predict_the_hidden_units_better_the_more_there_are(case):
 
     errors = []
     for rank in range(1, 9):
-        reduced = (centred @ basis.inverse[:rank].T) @ basis.axes[:, :rank].T
-        errors.append(error(reduced).item())
+        errors.append(error((centred @ basis.inverse[:rank].T) @ basis.axes[:, :rank].T).item())
         # What is left is the variance of the components that were left out.
         assert errors[-1] == pytest.approx(basis.variances[rank:].sum().item(), rel=1e-6, abs=1e-9)
     assert errors == sorted(errors, reverse=True) and errors[0] > errors[-2] > 1e-6

@@ -100,7 +100,8 @@ def inputs() -> st.SearchStrategy[Case]:
     """One file of a model, damaged."""
 
     def case(which: str, text: bool, chosen) -> Case:
-        path, name = MODEL / f"{which}.{'txt' if text else 'bin'}", f"{which} {'text' if text else 'binary'} {chosen}"
+        path = MODEL / f"{which}.{'txt' if text else 'bin'}"
+        name = f"{which} {'text' if text else 'binary'} {chosen}"
         damaged = file(name[:200], path, lambda path: path.write_bytes(damage(path.read_bytes(), chosen)), text)
         return damaged._replace(hostile=False)
 

@@ -354,7 +354,8 @@ def same_numbers(decoded: Decoded, heard: dict) -> None:
         (12, base_colors(splats["features_dc"])),
     ):
         assert_close(torch.tensor(table[:, first : first + value.shape[1]]), value[:count], **alike)
-    latents, width = np.frombuffer(base64.b64decode(heard["latents"]), "<f4"), rank + -rank % 4
+    width = rank + -rank % 4
+    latents = np.frombuffer(base64.b64decode(heard["latents"]), "<f4")
     latents = latents[: len(latents) // width * width].reshape(-1, width)[:, :rank]
     assert_close(torch.tensor(latents.copy()), splats["latents"][: len(latents)], **alike)
 

@@ -74,7 +74,7 @@ def test_lists_of_splits(scene):
     assert [path.name for path in parse(scene).image_filenames] == ["001.png", "002.png", "005.png"]
     assert [path.name for path in parse(scene, "val").image_filenames] == ["000.png", "009.png"]
     (scene / "train_list.txt").unlink()
-    with pytest.raises(InputError, match=r"there is test_list.txt, but no train_list.txt"):
+    with pytest.raises(InputError, match=r"test_list.txt, but no train_list.txt"):
         parse(scene)
 
 

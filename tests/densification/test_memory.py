@@ -131,8 +131,7 @@ def test_growth_is_held_in_a_small_share_of_a_card(name, tiny_scene, tmp_path, c
         "mcmc": {"budget": 2**24, "refine_every": 2},  # grows by 5 % at most
         "error-guided": {"budget": 10**7, "most_splats": 10**7, "warmup_length": 0, "refine_every": 30},
     }
-    args = arguments(tiny_scene, tmp_path, name, 800, **options.get(name, {}))
-    trainer = set_up(args)
+    trainer = set_up(arguments(tiny_scene, tmp_path, name, 800, **options.get(name, {})))
     if name == "original":
         trainer.pipeline.model.densification.threshold = 0.0
     torch.cuda.empty_cache()

@@ -336,7 +336,7 @@ def test_mistakes_are_told_in_a_sentence(trained, tmp_path):
         Web(trained["nrfgs-sh"], output=tmp_path / "page.html").main()
     lost = tmp_path / "config.yml"
     lost.write_text(trained["nrfgs"].read_text().replace("timestamp: ", "timestamp: no-"))
-    with pytest.raises(InputError, match="no checkpoints beside it"):
+    with pytest.raises(InputError, match="no checkpoints in .*, nor in .*\\. Put them"):
         Ply(lost, output=tmp_path / "s.ply").main()
 
 

@@ -35,7 +35,9 @@ def read_container(data: bytes) -> tuple[dict, dict[str, np.ndarray]]:
 def parts(data: bytes) -> tuple[dict, list[bytes]]:
     """The header of a file, and its streams as they are in it."""
     length = PREAMBLE.unpack_from(data)[2]
-    header, at, bodies = json.loads(data[PREAMBLE.size : PREAMBLE.size + length]), PREAMBLE.size + length + 4, []
+    header = json.loads(data[PREAMBLE.size : PREAMBLE.size + length])
+    at = PREAMBLE.size + length + 4
+    bodies = []
     for entry in header["streams"]:
         bodies.append(data[at : at + entry["bytes"]])
         at += entry["bytes"]

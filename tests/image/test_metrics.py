@@ -104,8 +104,7 @@ def test_what_lies_outside_the_mask_does_not_count():
 def test_masked_ssim_is_the_mean_over_centres_inside():
     pred, gt = pair(60, 70, dtype=torch.float64)
     mask = disc(60, 70, 14)
-    filled = torch.where(mask, pred, gt)
-    ssim_map = ssim_maps(*(image.movedim(-1, 0) for image in (filled, gt)))[0]
+    ssim_map = ssim_maps(*(image.movedim(-1, 0) for image in (torch.where(mask, pred, gt), gt)))[0]
     expected = np.mean([ssim_map[:, i - 5, j - 5].mean() for i, j, _ in mask.nonzero().tolist()])
     assert ssim(pred, gt, mask) == pytest.approx(expected, abs=1e-12)
 
@@ -187,8 +186,7 @@ def test_a_fit_undoes_an_affine_change_of_colours_inside_the_mask():
     pred, mask = truth * 0.5 + 0.1, torch.zeros(12, 12, 1, dtype=torch.bool)
     mask[3:9, 3:9] = True
     pred = torch.where(mask, pred, torch.zeros_like(pred))
-    fitted = fit_colors(pred, truth, mask)
-    torch.testing.assert_close(fitted[3:9, 3:9], truth[3:9, 3:9], atol=1e-5, rtol=0)
+    torch.testing.assert_close(fit_colors(pred, truth, mask)[3:9, 3:9], truth[3:9, 3:9], atol=1e-5, rtol=0)
     truth, flat = torch.rand(5, 5, 3), torch.full((5, 5, 3), 0.4)
     torch.testing.assert_close(fit_colors(flat, truth), truth.mean((0, 1)).expand(5, 5, 3), atol=1e-5, rtol=0)
     assert fit_colors(flat, truth, torch.zeros(5, 5, 1, dtype=torch.bool)) is flat

@@ -155,5 +155,4 @@ def test_bytes_and_large_pictures_are_the_same_as_small_ones_in_floats():
     other = sight(wall(), cameras[0], K * torch.tensor([[8.0], [8.0], [1.0]]), (large * 255).round().to(torch.uint8))
     common = torch.isin(one.points, other.points)
     assert common.sum() > 1000
-    difference = one.light[common] - other.light[torch.isin(other.points, one.points)]
-    assert difference.abs().median() < 0.02
+    assert (one.light[common] - other.light[torch.isin(other.points, one.points)]).abs().median() < 0.02

@@ -158,7 +158,8 @@ def test_points_are_where_the_cameras_see_them(prepared):
 
 
 def test_finished_work_is_not_repeated_and_changes_are_noticed(prepared, walls, tmp_path, monkeypatch):
-    out, source = shutil.copytree(prepared, tmp_path / "scene"), shutil.copytree(walls, tmp_path / "photos")
+    out = shutil.copytree(prepared, tmp_path / "scene")
+    source = shutil.copytree(walls, tmp_path / "photos")
     for name in ("extract_features", "match_features", "find_cameras", "undistort"):
         monkeypatch.setattr(structure, name, Mock(side_effect=TypeError))
     said = run_quietly(source, out)

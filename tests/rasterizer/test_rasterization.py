@@ -269,7 +269,8 @@ class TestOnCuda:
             leaves = [table.clone().requires_grad_() for table in tables]
             *geometry, colors, opacities = leaves
             seen = project(*geometry, *camera, ProjectionOptions(rasterize_mode, assume_finite=True))
-            rows, options = seen.gaussian_ids, {"with_depth": mode == "RGB+ED", "assume_finite": True}
+            rows = seen.gaussian_ids
+            options = {"with_depth": mode == "RGB+ED", "assume_finite": True}
             background = torch.full((1, 3), 0.3).cuda()
             image, _, info = composite(seen, colors[rows], opacities[rows], backgrounds=background, **options)
             image.backward(upstream)

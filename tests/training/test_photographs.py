@@ -138,8 +138,7 @@ def test_renderings_have_the_mean_look_or_a_photographs(exposed_scene, finished,
     model = pipeline.model
     camera = pipeline.datamanager.train_dataset.cameras[:1]
     mean = model.get_outputs_for_camera(camera)["rgb"]
-    brightest = max(model.photograph.names, key=lambda name: stops[name].mean())
-    monkeypatch.setenv("NRFGS_LOOK", brightest)
+    monkeypatch.setenv("NRFGS_LOOK", max(model.photograph.names, key=lambda name: stops[name].mean()))
     assert (model.get_outputs_for_camera(camera)["rgb"] - mean).mean() > 0.02
     monkeypatch.setenv("NRFGS_LOOK", "nobody.jpg")
     with pytest.raises(InputError, match="nobody.jpg"):  # a training says so before its first step

@@ -124,7 +124,8 @@ class FusedFunction(torch.autograd.Function):
                 opacities, visible, centers, *weights):  # fmt: skip
         tables = [_contiguous(table) for table in (means, latents, features_dc, opacities)]
         visible, centers, packed = _contiguous(visible), _contiguous(centers), _packed(packing, weights)
-        count, how = len(visible), launches.forward
+        how = launches.forward
+        count = len(visible)
         colors, seen = packed.new_empty(count, 3), packed.new_empty(count)
         if count > 0:
             launch_forward(

@@ -69,7 +69,8 @@ def export_web(
     contents = {output: text.encode()} if alone else {output / SCENE: scene, output / "index.html": text.encode()}
     for path, content in (contents | ({picture: poster} if preview else {})).items():
         write_whole(path, content)
-    size, name = sum(map(len, contents.values())), about["photographs"][about["start"]]["name"]
+    size = sum(map(len, contents.values()))
+    name = about["photographs"][about["start"]]["name"]
     lines = [
         f"{output}: {numbers['written']:,} splats, {size / 1e6:.2f} MB; 3DGS's PLY of as many splats has "
         f"{numbers['ply_bytes'] / 1e6:.2f} MB. It begins where {name} was taken."
@@ -101,11 +102,11 @@ def surroundings(pipeline) -> tuple[dict[str, Any], bytes]:
     """
     model, data = pipeline.model, pipeline.datamanager
     images = data.cached_train  # before the cameras: undistortion crops them while it loads the images
-    cameras, starts = data.train_dataset.cameras, []
+    cameras = data.train_dataset.cameras
+    starts = []
     for i in evenly_spaced(len(cameras), 8):
         outputs = model.get_outputs_for_camera(cameras[i : i + 1].to(model.device))
-        truth = model.truth_of(images[i], outputs["background"])
-        score = psnr(outputs["rgb"], truth, model.mask_of(images[i]))
+        score = psnr(outputs["rgb"], model.truth_of(images[i], outputs["background"]), model.mask_of(images[i]))
         starts.append((-math.inf if score is None else score, i, outputs["rgb"]))  # None: all is masked
     _, start, poster = max(starts, key=itemgetter(0))
 

@@ -34,8 +34,7 @@ def read_notes(file: Path | None) -> list[dict[str, Any]]:
     """Notes of a JSON file, {"notes": [{"text", "position", "camera" or none}, ...]}; without a file none."""
     if file is None:
         return []
-    content = _json(file)
-    if not isinstance(notes := content.get("notes"), list):
+    if not isinstance(notes := _json(file).get("notes"), list):
         raise InputError(f'{file} has no list "notes". "Save notes" in a page writes one.')
     for i, note in enumerate(notes):
         if not isinstance(note, dict) or not isinstance(note.get("text"), str):
@@ -51,20 +50,14 @@ def _photograph(word: str, names: Sequence[str]) -> int:
         return names.index(word)
     if word.isdecimal() and 1 <= int(word) <= len(names):
         return int(word) - 1
-    raise InputError(
-        f"--tour {word}: no such photograph. Give numbers from 1 to {len(names)}, names such as {names[0]}, or one "
-        ".json file."
-    )
+    raise InputError(f"--tour {word}: no such photograph. Give 1 to {len(names)}, names like {names[0]}, or one .json.")
 
 
 def _tour_in(file: Path) -> dict[str, Any]:
     content = _json(file)
     views = content.get("camera_path", content.get("tour"))
     if not isinstance(views, list) or len(views) < 2:
-        raise InputError(
-            f'{file} has neither "tour" nor "camera_path" with two views or more. "Save tour" in a page writes such a '
-            'file; so does "Save Path" in nerfstudio\'s viewer.'
-        )
+        raise InputError(f'{file} has no "tour" or "camera_path" of two views. "Save tour" in a page writes one.')
     if "camera_path" not in content:
         for i, view in enumerate(views):
             _camera(view, f"{file}: tour[{i}]")
@@ -76,9 +69,11 @@ def _tour_in(file: Path) -> dict[str, Any]:
         raise InputError(f"{file}: seconds is {seconds}; it must be positive.")
     loop = bool(content.get("is_cycle", False))
     views = views + views[:1] if loop else views
-    count, kept = min(len(views), max(2, math.ceil(VIEWS_A_SECOND * seconds) + 1)), []
+    count = min(len(views), max(2, math.ceil(VIEWS_A_SECOND * seconds) + 1))
+    kept = []
     for i in (round(k * (len(views) - 1) / (count - 1)) for k in range(count)):
-        where, view = f"{file}: camera_path[{i}]", views[i] if isinstance(views[i], dict) else {}
+        where = f"{file}: camera_path[{i}]"
+        view = views[i] if isinstance(views[i], dict) else {}
         matrix = _numbers(view.get("camera_to_world"), 16, f"{where}.camera_to_world")
         columns = [matrix[4 * row + column] for column in range(4) for row in range(4)]
         kept.append({"matrix": columns, "fov": view.get("fov"), "aspect": view.get("aspect")})

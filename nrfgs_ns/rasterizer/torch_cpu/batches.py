@@ -171,7 +171,9 @@ def similar_tiles(remaining: Tensor, tiles: Tensor, pixels: int) -> list[tuple[T
     """Cut tiles, sorted by falling number of splats, into groups that fit into a batch: tiles, and their largest
     number."""
     counts = remaining.tolist()
-    groups, begin, elements = [], 0, batch_elements()
+    groups = []
+    begin = 0
+    elements = batch_elements()
     while begin < len(counts):
         end = min(len(counts), begin + max(1, elements // ((counts[begin] + 1) * pixels)))
         enough = 0.75 * counts[begin] - 4  # bounds the padding to a quarter, or four splats

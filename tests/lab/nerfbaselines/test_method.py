@@ -77,7 +77,8 @@ def test_cameras_and_points_are_where_nerfstudio_has_them(tiny_scene):
 
 
 def test_a_checkpoint_renders_without_the_images(tiny_scene, tmp_path):
-    method, folder = Nrfgs(train_dataset=read(tiny_scene, "train"), config_overrides=OPTIONS), tmp_path / "first"
+    folder = tmp_path / "first"
+    method = Nrfgs(train_dataset=read(tiny_scene, "train"), config_overrides=OPTIONS)
     train(method, 0, STEPS)
     method.save(str(folder))
     loaded = Nrfgs(checkpoint=str(folder))
@@ -105,7 +106,8 @@ def test_a_checkpoint_renders_without_the_images(tiny_scene, tmp_path):
 
 def test_a_training_goes_on_as_if_it_had_not_stopped(tiny_scene, tmp_path):
     """`nrfgs-fast`, whose place in its schedules, three steps for each one, is part of the checkpoint."""
-    dataset, options = read(tiny_scene, "train"), {"pipeline.model.num_downscales": 0}
+    dataset = read(tiny_scene, "train")
+    options = {"pipeline.model.num_downscales": 0}
     unbroken = NrfgsFast(train_dataset=dataset, config_overrides=options)
     train(unbroken, 0, 3)
     unbroken.save(str(tmp_path / "checkpoint"))
