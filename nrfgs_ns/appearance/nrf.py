@@ -26,7 +26,7 @@ On the logit the residual scales with the opacity: n copies of a splat, each of 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple, get_args, get_type_hints
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -107,8 +107,12 @@ class NrfConfig(AppearanceHeadConfig):
         for name in ("color_scale", "opacity_scale"):
             self.require(getattr(self, name) >= 0, name, "zero or positive")
         self.require(self.distance_eps > 0, "distance_eps", "positive")
-        for name in ("output_init", "opacity_bound", "implementation", "precision"):
-            choices = (None, *OPACITY_BOUNDS) if name == "opacity_bound" else get_args(get_type_hints(NrfConfig)[name])
+        for name, choices in (
+            ("output_init", ("zero", "default")),
+            ("opacity_bound", (None, *OPACITY_BOUNDS)),
+            ("implementation", ("auto", "torch", "fused")),
+            ("precision", ("fp32", "tf32", "bf16", "fp16")),
+        ):
             self.require(getattr(self, name) in choices, name, "one of " + ", ".join(map(repr, choices)))
 
 

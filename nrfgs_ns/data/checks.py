@@ -111,4 +111,4 @@ def check_headers(paths: Sequence[Path], sizes: Sequence[tuple[int, int]], what:
     headers = [(path, read_size(path), tuple(size)) for path, size in zip(paths, sizes, strict=True)]
     wrong = [f"{path} is {w} x {h}, not {size[0]} x {size[1]}" for path, (w, h), size in headers if (w, h) != size]
     if wrong:
-        raise InputError(f"{len(wrong)} {what} unlike their cameras' w x h / downscale factor: {some(wrong)}. {fix}")
+        raise InputError(f"{what}: {len(wrong)} do not match their cameras' (downscaled) size: {some(wrong)}. {fix}")

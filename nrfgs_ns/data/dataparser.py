@@ -174,7 +174,7 @@ class NrfgsDataParser(DataParser):
         named = self._named_splits(meta)
         if named and "train" not in named:
             there = next(iter(named.values()))[0]  # test_filenames, test_list.txt
-            raise InputError(f"{source}: {there}, but no train_{there.partition('_')[2]}. Name the training images.")
+            raise InputError(f"{source} has {there}, but no train_{there.partition('_')[2]}. Name the training images.")
         splits = (
             split_by_names(named, paths, self._file, source) if named else split_by_rule(self.config, paths, source)
         )

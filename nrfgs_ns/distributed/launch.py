@@ -23,7 +23,7 @@ def prepare(config: TrainerConfig) -> None:
         InputError: the devices are CPUs, or this machine has fewer GPUs than the training asks for.
     """
     if config.machine.device_type == "cpu":
-        raise InputError("Several processes need GPUs; on CPUs use python -m nrfgs_lab.many_processes, same options.")
+        raise InputError("ns-train starts several processes on GPUs alone. On CPUs: python -m nrfgs_lab.many_processes")
     wanted = config.machine.num_devices
     if (present := torch.cuda.device_count()) < wanted:
         raise InputError(f"machine.num_devices is {wanted}, but this machine shows {present} GPUs.")

@@ -116,7 +116,8 @@ class NrfgsPipeline(VanillaPipeline):
         factor = 2**self.config.model.num_downscales
         width, height = (int(side.min()) // factor for side in (cameras.width, cameras.height))
         if min(width, height) < SMALLEST_SIDE:
-            raise InputError(f"Training begins at {width} x {height} pixels: lower --pipeline.model.num-downscales.")
+            fix = "Give a smaller --pipeline.model.num-downscales, or larger images."
+            raise InputError(f"Training would begin with images of {width} x {height} pixels, too few for SSIM. {fix}")
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint, or the compact file that the configuration names; InputError if it does not fit.
