@@ -99,6 +99,19 @@ def test_a_commands_traceback_is_shown_when_asked_for():
     assert "Traceback" in subprocess.run(words, capture_output=True, text=True, env=environment, timeout=300).stderr
 
 
+@pytest.mark.parametrize("code, said", [
+    ("print('word ' * 10_000)", ""), ("raise BrokenPipeError('of a socket')", "BrokenPipeError: of a socket"),
+])  # fmt: skip
+def test_output_that_nobody_reads_on_ends_a_command_quietly(code, said):
+    """As that of `nrfgs doctor | head -1`."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    words = [sys.executable, "-c", f"from nrfgs_ns.errors import mind_the_reader; mind_the_reader(); {code}"]
+    run = subprocess.run(words, stdout=-1 if said else writer, stderr=-1, text=True, timeout=300)
+    os.close(writer)
+    assert run.returncode == 1 and (said in run.stderr if said else run.stderr == "")
+
+
 def test_writers_do_not_meet(tmp_path):
     """Four writers and a reader: nobody fails, and what is read is what one of them wrote."""
     file, texts = tmp_path / "table.md", [letter * 200_000 for letter in "abcd"]
