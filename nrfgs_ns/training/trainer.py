@@ -165,8 +165,10 @@ class NrfgsTrainer(Trainer):
             return
         if written is not None:
             pace.load_state(written)
+        elif pace.length < (step := self._start_step):
+            raise InputError(f"Schedules of {pace.length} steps end before step {step}. Give more --schedule-steps.")
         else:
-            pace.position = float(self._start_step)  # the checkpoint's schedules were not stretched
+            pace.position = float(step)  # the checkpoint's schedules were not stretched
         if not isinstance(pace, TimedPace):
             rate = (pace.length - pace.position) / self.config.max_num_iterations
             if not math.isclose(rate, pace.rate, rel_tol=1e-9):  # an unchanged rate stays the same to the last bit

@@ -169,6 +169,8 @@ def test_a_finished_training_says_so_and_how_to_extend_it(finished, tiny_scene, 
     folder = models_of(finished)
     with pytest.raises(InputError, match="is the end of a training of 12 steps: --max-num-iterations 24 makes"):
         ready(tiny_scene, tmp_path / "b", {"--load-dir": folder})
+    with pytest.raises(InputError, match="Schedules of 5 steps end before step 12. Give"):
+        ready(tiny_scene, tmp_path / "b", {"--load-dir": folder, "--schedule-steps": 5}, steps=STEPS + 2)
     longer = ready(tiny_scene, tmp_path / "c", {"--load-dir": folder}, steps=STEPS + 2)
     assert writer.GLOBAL_BUFFER["max_iter"] == STEPS + 2
     longer.train()
