@@ -139,7 +139,7 @@ class NrfgsTrainer(Trainer):
         if config.time_budget is None and self._start_step >= self.total_steps:
             schedules = "" if config.schedule_steps is None else f" --schedule-steps {config.schedule_steps}"
             longer = f"--max-num-iterations {2 * self._start_step}{schedules} makes as many more"
-            raise InputError(f"{path} is the end of a training of {self.total_steps:,} steps: {longer}.")
+            raise InputError(f"{path} is the end of a training of {self._start_step:,} steps: {longer}.")
         if weights := list(self.pipeline.model.head.parameters()):  # of a smaller head, perhaps, than was built
             self.optimizers.hold("field", weights)
         self.optimizers.load_optimizers(content["optimizers"])
