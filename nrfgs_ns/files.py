@@ -15,8 +15,8 @@ def check_writable(path: Path, option: str) -> None:
     """Raise InputError where a file cannot be written: before a command's work, which makes its folders, not after it.
     `option` named the file."""
     try:
-        if path.is_dir():
-            raise InputError(f"{option} {path} is a folder. Name a file in it.")
+        if path.exists() and not path.is_file():  # a device would be replaced
+            raise InputError(f"{option} {path} is a folder or a device. Name a file.")
         folder = next(folder for folder in path.parents if folder.exists())
         with tempfile.NamedTemporaryFile(dir=folder, prefix=f"{path.name}.", suffix=".writing"):
             pass

@@ -97,7 +97,6 @@ def test_it_is_the_last_line_and_the_status_1(words, said, debug):
     ("print('word ' * 10_000)", ""), ("raise BrokenPipeError('of a socket')", "BrokenPipeError: of a socket"),
 ])  # fmt: skip
 def test_output_that_nobody_reads_on_ends_a_command_quietly(code, said):
-    """As that of `nrfgs doctor | head -1`."""
     reader, writer = os.pipe()
     os.close(reader)
     words = [sys.executable, "-c", f"from nrfgs_ns.errors import mind_the_reader; mind_the_reader(); {code}"]
@@ -138,8 +137,9 @@ def test_what_cannot_be_written_is_told_beforehand(tmp_path):
     check_writable(tmp_path / "file", "--output")
     check_writable(tmp_path / "new" / "ü" / "file", "--output")
     assert (tmp_path / "file").read_text() == "old" and len(list(tmp_path.iterdir())) == 1, "nothing is made"
-    with pytest.raises(InputError, match="--report .* is a folder"):
-        check_writable(tmp_path, "--report")
+    for path in (tmp_path, Path("/dev/null")):
+        with pytest.raises(InputError, match=f"--report {path} is a folder or a device"):
+            check_writable(path, "--report")
     for path in (tmp_path / "file" / "x", tmp_path / ("x" * 250), tmp_path / ("x" * 300) / "x"):
         with pytest.raises(InputError, match="--output .* cannot be written .*Name a file"):
             check_writable(path, "--output")
