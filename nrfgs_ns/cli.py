@@ -15,7 +15,7 @@ from importlib.util import find_spec
 
 import tyro
 
-from nrfgs_ns.errors import DEBUG, InputError
+from nrfgs_ns.errors import DEBUG, InputError, mind_the_reader
 
 GROUP = "nrfgs.commands"
 NO_ROOM = errno.ENOSPC, errno.EDQUOT, errno.EFBIG  # a full disk, a quota, a limit on the size of files
@@ -61,6 +61,7 @@ def chosen(arguments: list[str]):
 
 def entrypoint() -> None:
     """The console script `nrfgs COMMAND`."""
+    mind_the_reader()
     # Deprecations in nerfstudio, and a loss that it logs undetached, do not concern the user.
     warnings.simplefilter("ignore", FutureWarning)
     warnings.filterwarnings("ignore", "Converting a tensor with requires_grad=True to a scalar")

@@ -2,6 +2,7 @@
 """Exceptions meant for the user rather than for the programmer."""
 
 import os
+import sys
 
 DEBUG = os.environ.get("NRFGS_DEBUG", "0") not in ("", "0")
 """NRFGS_DEBUG=1: such exceptions show their traceback, and ns-train its whole configuration."""
@@ -21,3 +22,18 @@ class InputError(ForTheUser, ValueError):
     The message has three parts: the file or field, what was found there, and what the user can do next. It is raised
     before time is spent on training.
     """
+
+
+def mind_the_reader() -> None:
+    """From now on a command whose output nobody reads on (`| head`) ends without a traceback, with status 1."""
+    show = sys.excepthook
+
+    def show_if_read(kind, error, trace):
+        try:
+            if kind is BrokenPipeError:
+                print(flush=True)  # fails if it was standard output
+            show(kind, error, trace)
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is left to write
+
+    sys.excepthook = show_if_read

@@ -12,13 +12,13 @@ from nrfgs_ns.errors import InputError
 
 
 def check_writable(path: Path, option: str) -> None:
-    """Make a file's folders, and raise InputError where it cannot be written: before a command's work, not after it.
+    """Raise InputError where a file cannot be written: before a command's work, which makes its folders, not after it.
     `option` named the file."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.is_dir():
-            raise InputError(f"{option} {path} is a folder. Name a file in it.")
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f"{path.name}.", suffix=".writing"):
+        if path.exists() and not path.is_file():  # a device would be replaced
+            raise InputError(f"{option} {path} is a folder or a device. Name a file.")
+        folder = next(folder for folder in path.parents if folder.exists())
+        with tempfile.NamedTemporaryFile(dir=folder, prefix=f"{path.name}.", suffix=".writing"):
             pass
     except OSError as error:
         raise InputError(f"{option} {path} cannot be written ({error}). Name a file in a folder of yours.") from error

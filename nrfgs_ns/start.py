@@ -13,18 +13,21 @@ import sys
 import warnings
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NoReturn
 
 from nerfstudio.configs import external_methods
 from nerfstudio.utils import misc
+from nerfstudio.utils.rich_utils import CONSOLE
 
-from nrfgs_ns.errors import DEBUG
+from nrfgs_ns.errors import DEBUG, mind_the_reader
 
 
 def with_data_parsers() -> None:
     """Speed up nerfstudio's next imports; silence their deprecation warnings unless NRFGS_DEBUG=1."""
     gc.freeze()  # imported objects stay: the collector need not visit them
     atexit.register(gc.unfreeze)  # frozen objects are not destroyed in order, and Triton's bindings complain
+    mind_the_reader()
+    CONSOLE.on_broken_pipe = _reader_is_gone
     if not DEBUG:
         warnings.filterwarnings("ignore", category=FutureWarning, module=r"(torch|nerfstudio)(\.|$)")
     for stream in (sys.stdout, sys.stderr):
@@ -38,6 +41,11 @@ def with_methods() -> None:
     """Speed up nerfstudio's work before it reads the command line."""
     gc.freeze()
     external_methods.inspect = SimpleNamespace(stack=_names_of_callers)
+
+
+def _reader_is_gone() -> NoReturn:
+    """An error, with which a training is saved; rich's own ends the process."""
+    raise BrokenPipeError("nobody reads the output on")
 
 
 def _compile_when_called(torch_compile: Callable) -> Callable:

@@ -90,14 +90,21 @@ class Run:
             self.work / name
             for name in ("photos", "database.db", "model", "undistorted", "likely_pairs.json", "state.json")
         )
-        ours = self.state_file.is_file() or (self.out / "prepare.json").is_file()
+        self.verdict_file, self.source = self.out / "prepare.json", str(options.photos.resolve())
+        ours = self.state_file.is_file() or self.verdict_file.is_file()
         if self.out.exists() and not ours and (self.out.is_file() or any(self.out.iterdir())):
             raise InputError(f"{self.out} exists and was not made by `nrfgs prepare`. Name a new or an empty folder.")
+        self.state, made = self._read(self.state_file), self._read(self.verdict_file)
+        self.key = self.digest = files.digest(self.inputs)
+        if made.get("digest", self.digest) != self.digest and (other := made.get("source")) != self.source:
+            fix = "Name another folder, or delete this one."
+            raise InputError(f"{self.out} has the scene of other photographs, {other}. {fix}")
+
+    def _read(self, file: Path) -> dict[str, Any]:
         try:
-            self.state = dict(json.loads(self.state_file.read_text())) if self.state_file.is_file() else {}
+            return dict(json.loads(file.read_text())) if file.is_file() else {}
         except (ValueError, TypeError) as error:
-            raise InputError(f"{self.state_file} is damaged ({error}). Delete {self.out} and begin again.") from error
-        self.key = files.digest(self.inputs)
+            raise InputError(f"{file} is damaged ({error}). Delete {self.out} and begin again.") from error
 
     def all(self) -> None:
         """Run every stage, and print the verdict."""
@@ -234,6 +241,8 @@ class Run:
         total = len(self.names)
         registered = model.num_reg_images()
         numbers = {
+            "source": self.source,
+            "digest": self.digest,
             "photographs": total,
             "registered": registered,
             "points": model.num_points3D(),
@@ -245,7 +254,7 @@ class Run:
             "seconds_and_cpu_seconds": self.state["seconds"],
             "options": {name: value for name, value in asdict(self.options).items() if name not in ("photos", "out")},
         }
-        write_whole(self.out / "prepare.json", json.dumps(numbers, indent=1) + "\n")
+        write_whole(self.verdict_file, json.dumps(numbers, indent=1) + "\n")
         error = numbers["mean_reprojection_error_px"]
         cameras = [model.cameras[model.images[number].camera_id] for number in model.reg_image_ids()]
         shortest = min(camera.mean_focal_length() / max(camera.width, camera.height) for camera in cameras)

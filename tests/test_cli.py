@@ -80,23 +80,29 @@ def test_a_training_is_named_in_any_form(tmp_path, monkeypatch, capsys):
 
 
 # Messages for the user, and files written whole.
-RAISE = "from nrfgs_ns.errors import InputError\nraise InputError('x.json is missing. Make one.')"
-
-
 @pytest.mark.parametrize("debug", ["0", "1"])
-def test_it_is_the_last_line_and_the_status_1(debug):
+@pytest.mark.parametrize("words, said", [
+    (["-c", "from nrfgs_ns.errors import InputError; raise InputError('x.json is missing.')"], "x.json is missing."),
+    (["-m", "nrfgs_ns.cli", "exprot"], "Did you mean `nrfgs export`?"),
+])  # fmt: skip
+def test_it_is_the_last_line_and_the_status_1(words, said, debug):
     environment = {**os.environ, "NRFGS_DEBUG": debug}
-    run = subprocess.run([sys.executable, "-c", RAISE], capture_output=True, text=True, env=environment, timeout=300)
-    assert run.returncode == 1
-    assert run.stderr.splitlines()[-1].endswith("x.json is missing. Make one.")
-    assert ("Traceback" in run.stderr) == (debug == "1")
-    if debug == "0":
-        assert run.stderr == "x.json is missing. Make one.\n"
+    run = subprocess.run([sys.executable, *words], capture_output=True, text=True, env=environment, timeout=300)
+    lines = run.stderr.splitlines()
+    assert run.returncode == 1 and lines[-1].endswith(said)
+    assert ("Traceback" in run.stderr) == (debug == "1") == (len(lines) > 1)
 
 
-def test_a_commands_traceback_is_shown_when_asked_for():
-    environment, words = {**os.environ, "NRFGS_DEBUG": "1"}, [sys.executable, "-m", "nrfgs_ns.cli", "no-such"]
-    assert "Traceback" in subprocess.run(words, capture_output=True, text=True, env=environment, timeout=300).stderr
+@pytest.mark.parametrize("code, said", [
+    ("print('word ' * 10_000)", ""), ("raise BrokenPipeError('of a socket')", "BrokenPipeError: of a socket"),
+])  # fmt: skip
+def test_output_that_nobody_reads_on_ends_a_command_quietly(code, said):
+    reader, writer = os.pipe()
+    os.close(reader)
+    words = [sys.executable, "-c", f"from nrfgs_ns.errors import mind_the_reader; mind_the_reader(); {code}"]
+    run = subprocess.run(words, stdout=-1 if said else writer, stderr=-1, text=True, timeout=300)
+    os.close(writer)
+    assert run.returncode == 1 and (said in run.stderr if said else run.stderr == "")
 
 
 def test_writers_do_not_meet(tmp_path):
@@ -130,9 +136,10 @@ def test_what_cannot_be_written_is_told_beforehand(tmp_path):
     (tmp_path / "file").write_text("old")
     check_writable(tmp_path / "file", "--output")
     check_writable(tmp_path / "new" / "ü" / "file", "--output")
-    assert (tmp_path / "file").read_text() == "old" and not list((tmp_path / "new" / "ü").iterdir())
-    with pytest.raises(InputError, match="--report .*new is a folder"):
-        check_writable(tmp_path / "new", "--report")
-    for path in (tmp_path / "file" / "x", tmp_path / ("x" * 250)):
+    assert (tmp_path / "file").read_text() == "old" and len(list(tmp_path.iterdir())) == 1, "nothing is made"
+    for path in (tmp_path, Path("/dev/null")):
+        with pytest.raises(InputError, match=f"--report {path} is a folder or a device"):
+            check_writable(path, "--report")
+    for path in (tmp_path / "file" / "x", tmp_path / ("x" * 250), tmp_path / ("x" * 300) / "x"):
         with pytest.raises(InputError, match="--output .* cannot be written .*Name a file"):
             check_writable(path, "--output")

@@ -46,14 +46,6 @@ def test_a_parser_that_is_named_has_splatfactos_defaults(parser):
     assert ours.pipeline.datamanager.dataparser == theirs.pipeline.datamanager.dataparser
 
 
-@pytest.mark.parametrize("method, kind, decay", [(menu.nrfgs_vdgs, "Adam", 0.0), (menu.nrfgs_gsnb, "AdamW", 0.01)])
-def test_shared_weights_of_others_have_their_references_optimisers(method, kind, decay):
-    config = method.config.optimizers["field"]
-    optimizer = config["optimizer"].setup([torch.nn.Parameter(torch.zeros(1))])
-    assert type(optimizer) is getattr(torch.optim, kind) and config["scheduler"] is None
-    assert (optimizer.defaults["lr"], optimizer.defaults["weight_decay"]) == (1e-3, decay)
-
-
 @pytest.mark.parametrize("name", METHODS)
 def test_everything_else_is_splatfactos(name):
     (method, groups), host = METHODS[name], method_configs["splatfacto"]

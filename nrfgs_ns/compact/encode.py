@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from nrfgs_ns.appearance.head import Field
 from nrfgs_ns.compact.format import Table
@@ -46,22 +47,26 @@ LARGEST_HALF = 6e4
 LARGEST_CODE = 2**30
 
 
+def drawable(splats: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The finite splats with a rotation; InputError if there are none."""
+    finite = torch.cat([value.detach().flatten(1) for value in splats.values()], dim=1).isfinite().all(dim=1)
+    finite &= splats["quats"].detach().abs().amax(dim=1) > 0
+    if not finite.any():
+        raise InputError(f"None of the {len(finite)} splats is finite: there is nothing to write.")
+    return {name: value[finite] for name, value in splats.items()}
+
+
 def encode(
     field: Field, render: dict[str, Any], steps: Mapping[str, np.ndarray] | None = None, coarser: float = 1.0
 ) -> tuple[dict[str, Any], dict[str, np.ndarray | Table]]:
-    """The header and streams of a compact file of the finite splats; InputError if there are none.
+    """The header and streams of a compact file of the splats that are `drawable`.
 
     Args:
         render: the header's "render".
         steps: of a fine-tuned field's tables; None: `steps_of`.
         coarser: factor of all steps.
     """
-    finite = torch.cat([value.detach().flatten(1) for value in field.splats.values()], dim=1)
-    finite = finite.isfinite().all(dim=1)
-    finite &= field.splats["quats"].detach().abs().amax(dim=1) > 0
-    if not finite.any():
-        raise InputError(f"None of the {len(finite)} splats is finite: there is nothing to write.")
-    tables = tables_of({name: value[finite] for name, value in field.splats.items()})
+    tables = tables_of(drawable(field.splats))
     tables["opacities"] = tables["opacities"].clamp(-LARGEST_LOGIT, LARGEST_LOGIT)
     steps = {name: coarser * step for name, step in (steps_of(tables) if steps is None else steps).items()}
     needed = np.ptp(tables["means"].cpu().numpy(), axis=0) / (2**MOST_BITS - 1)

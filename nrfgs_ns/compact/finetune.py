@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from nrfgs_ns.appearance.head import Field, Sight, SplatAppearance, ViewNoise
 from nrfgs_ns.appearance.reduce import build, latent_basis, with_components, with_rank
+from nrfgs_ns.compact.encode import drawable
 from nrfgs_ns.compact.rate import Density, Rounded, bits_of_places
 from nrfgs_ns.compact.tables import COLUMNS, MOST_BITS, Grid, morton, splats_of, steps_of, tables_of
 from nrfgs_ns.data.views import camera_spacing
@@ -171,8 +172,9 @@ def fine_tune(
     # Latents begin as their own principal components.
     field = with_rank(field, latent_basis(field, contributions_to(model, cameras)), field.head.config.latent_dim)
     head = build(field.head.config, field.head.state_dict(), field.head.scene_unit).requires_grad_(True).train()
-    coded = CodedSplats(field.splats)
-    count = len(field.splats["means"])
+    splats = drawable(field.splats)
+    coded = CodedSplats(splats)
+    count = len(splats["means"])
     of_bits = torch.tensor(rate / (8 * count), device=model.device)  # loss of a bit
     smallest, largest = (limit / (8 * count) for limit in RATES_FOR_SIZE)
     haste = min(HASTE * EVERY / steps, HASTIEST)

@@ -140,7 +140,7 @@ class NrfgsTrainer(Trainer):
         if config.time_budget is None and self._start_step >= self.total_steps:
             schedules = "" if config.schedule_steps is None else f" --schedule-steps {config.schedule_steps}"
             longer = f"--max-num-iterations {2 * self._start_step}{schedules} makes as many more"
-            raise InputError(f"{path} is the end of a training of {self.total_steps:,} steps: {longer}.")
+            raise InputError(f"{path} is the end of a training of {self._start_step:,} steps: {longer}.")
         if weights := list(self.pipeline.model.head.parameters()):  # of a smaller head, perhaps, than was built
             self.optimizers.hold("field", weights)
         self.optimizers.load_optimizers(content["optimizers"])
@@ -166,8 +166,10 @@ class NrfgsTrainer(Trainer):
             return
         if written is not None:
             pace.load_state(written)
+        elif pace.length < (step := self._start_step):
+            raise InputError(f"Schedules of {pace.length} steps end before step {step}. Give more --schedule-steps.")
         else:
-            pace.position = float(self._start_step)  # the checkpoint's schedules were not stretched
+            pace.position = float(step)  # the checkpoint's schedules were not stretched
         if not isinstance(pace, TimedPace):
             rate = (pace.length - pace.position) / self.config.max_num_iterations
             if not math.isclose(rate, pace.rate, rel_tol=1e-9):  # an unchanged rate stays the same to the last bit

@@ -24,7 +24,7 @@ from nrfgs_ns.appearance.reduce import build
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import LARGEST_LOGIT, encode
 from nrfgs_ns.compact.entropy import encode_table
-from nrfgs_ns.compact.finetune import CodedSplats, Gated, growth_without
+from nrfgs_ns.compact.finetune import CodedSplats, Gated, fine_tune, growth_without
 from nrfgs_ns.compact.rate import Density, Rounded, bits_of_places
 from nrfgs_ns.compact.tables import NEAR, OCTAHEDRAL, STEPS, Grid, from_morton, morton, nearest_turn
 from nrfgs_ns.errors import InputError
@@ -217,6 +217,13 @@ def test_a_model_is_trained_for_the_file(exported, tmp_path):
         assert found["loss_db"] < 0.1, "it has been trained on"
     assert (steps["3e-3"] > 1.1 * steps["0"]).all()
     assert bytes_of["3e-3"] < 0.8 * bytes_of["0"]
+
+
+def test_a_splat_without_a_rotation_is_left_out_of_a_fine_tune(exported):
+    pipeline = load_model(exported[0], "test")
+    pipeline.model.gauss_params["quats"].data[5] = 0.0
+    one, _, _ = fine_tune(pipeline, 1, 0.0, lambda bits: None)
+    assert 0 < len(one.splats["means"]) < pipeline.model.num_points and one.splats["quats"].isfinite().all()
 
 
 def test_what_a_splat_is_worth_is_what_pictures_lose_without_it(exported):

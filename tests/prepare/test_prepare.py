@@ -157,7 +157,7 @@ def test_points_are_where_the_cameras_see_them(prepared):
     assert len(np.unique(rgb)) > 20
 
 
-def test_finished_work_is_not_repeated_and_changes_are_noticed(prepared, walls, tmp_path, monkeypatch):
+def test_finished_work_is_not_repeated_and_changes_are_noticed(prepared, walls, three, tmp_path, monkeypatch):
     out = shutil.copytree(prepared, tmp_path / "scene")
     source = shutil.copytree(walls, tmp_path / "photos")
     for name in ("extract_features", "match_features", "find_cameras", "undistort"):
@@ -176,6 +176,9 @@ def test_finished_work_is_not_repeated_and_changes_are_noticed(prepared, walls, 
             run_quietly(source, out, **options)
     shutil.rmtree(out)
     shutil.copytree(prepared, out)
+    with pytest.raises(InputError, match=f"{out} has the scene of other photographs, {walls}. Name another"):
+        run_quietly(three, out)
+    run_quietly(source, out)  # the same ones elsewhere: from now on changes there count
     (source / "IMG 03.png").write_bytes((source / "IMG 02.png").read_bytes())
     with pytest.raises(TypeError):
         run_quietly(source, out)

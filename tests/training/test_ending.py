@@ -12,6 +12,7 @@ from unittest.mock import Mock
 import pytest
 import torch
 from densification_cases import Table
+from nerfstudio.utils.rich_utils import CONSOLE
 from short_trainings import assert_same_training, checkpoint_of, command_line, config_with, models_of, set_up, trained
 
 from nrfgs_lab.training_run import parse
@@ -129,7 +130,8 @@ def test_another_failure_saves_too_and_is_raised(disk_is_full, tiny_scene, tmp_p
     trainer = ready(tiny_scene, tmp_path)
     if disk_is_full:
         monkeypatch.setattr(checkpoint_files, "write", Mock(side_effect=DiskFull("The disk is full.")))
-    at_step(trainer, 4, Mock(side_effect=BrokenPipeError("the log is gone")))
+    monkeypatch.setattr(CONSOLE, "_file", Mock(["write"], write=Mock(side_effect=BrokenPipeError("the log is gone"))))
+    at_step(trainer, 4, lambda: CONSOLE.print("a line"))
     with pytest.raises(BrokenPipeError):
         trainer.train()
     assert list(find(trainer.checkpoint_dir)) == ([] if disk_is_full else [3])
@@ -166,7 +168,9 @@ def test_a_full_disk_is_survived_until_the_end(tiny_scene, tmp_path, monkeypatch
 def test_a_finished_training_says_so_and_how_to_extend_it(finished, tiny_scene, tmp_path):
     folder = models_of(finished)
     with pytest.raises(InputError, match="is the end of a training of 12 steps: --max-num-iterations 24 makes"):
-        ready(tiny_scene, tmp_path / "b", {"--load-dir": folder})
+        ready(tiny_scene, tmp_path / "b", {"--load-dir": folder}, steps=STEPS - 1)
+    with pytest.raises(InputError, match="Schedules of 5 steps end before step 12. Give"):
+        ready(tiny_scene, tmp_path / "b", {"--load-dir": folder, "--schedule-steps": 5}, steps=STEPS + 2)
     longer = ready(tiny_scene, tmp_path / "c", {"--load-dir": folder}, steps=STEPS + 2)
     assert writer.GLOBAL_BUFFER["max_iter"] == STEPS + 2
     longer.train()
