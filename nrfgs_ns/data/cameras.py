@@ -67,10 +67,8 @@ def read_cameras(meta: dict[str, Any], source: Path, config: Any) -> tuple[Camer
     poses = check_poses(frames, source, need_spread=scaled)
     orientation = meta.get("orientation_override", config.orientation_method)
     if orientation not in ORIENTATIONS:
-        raise InputError(
-            f"{source}: orientation_override is {shown(repr(orientation))}. Use one of {', '.join(ORIENTATIONS)}, or "
-            "remove it."
-        )
+        fix = f"Use one of {', '.join(ORIENTATIONS)}, or remove it."
+        raise InputError(f"{source}: orientation_override is {shown(repr(orientation))}. {fix}")
     placed, transform, scale = place(poses, orientation, config.center_method, scaled, config.scale_factor)
     scale *= number(meta.get("applied_scale", 1.0))
     return cameras_of(meta, lenses, placed, source), lenses, transform, scale
@@ -104,10 +102,8 @@ def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -
 
     position = poses[:, :3, 3]
     if need_spread and np.ptp(position, axis=0).max() <= POSITION_TOLERANCE * np.abs(position).max():
-        raise InputError(
-            f"{source}: all {len(frames)} cameras stand at the same place, so the scene has no scale and no depth. "
-            "Recompute the poses from images with parallax, or set --auto-scale-poses False."
-        )
+        fix = "Recompute the poses from images with parallax, or set --auto-scale-poses False."
+        raise InputError(f"{source}: all {len(frames)} cameras stand at the same place: no scale, no depth. {fix}")
     distance = np.linalg.norm(position - np.median(position, axis=0), axis=1)
     usual = np.quantile(distance, 0.75)
     reject(
@@ -225,10 +221,8 @@ def _check_model(meta: dict[str, Any], source: Path) -> None:
         where = "of the top level" if holder is meta else f"of {shown(holder['file_path'])}"
         named = holder.get("camera_model", model)
         if named not in drawn or CAMERA_MODEL_TO_TYPE[named] != CAMERA_MODEL_TO_TYPE[model]:
-            raise InputError(
-                f"{source}: camera_model {where} is {shown(repr(named))}. Use one of {', '.join(drawn)} at the "
-                "top level for all frames, or undistort the photographs to one of them."
-            )
+            fix = f"Use one of {', '.join(drawn)} at the top level for all frames, or undistort to one of them."
+            raise InputError(f"{source}: camera_model {where} is {shown(repr(named))}. {fix}")
         for key in UNREAD if CAMERA_MODEL_TO_TYPE[model] != CameraType.FISHEYE else UNREAD[:-1]:
             if holder.get(key, 0) != 0:
                 raise InputError(

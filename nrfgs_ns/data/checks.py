@@ -83,10 +83,8 @@ def check_frames(frames: list[dict[str, Any]], source: Path) -> None:
     check_unique((os.path.normpath(frame["file_path"]) for frame in frames), f"{source}: frames")
     unmasked = [frames[row]["file_path"] for row in without("mask_path")]
     if unmasked and any("mask_path" in frame for frame in frames):
-        raise InputError(
-            f"{source}: mask_path is given for some frames but not for {some(unmasked)}. Give one for every frame (an "
-            "all-white mask keeps the whole image), or for none."
-        )
+        fix = "Give one for every frame (an all-white mask keeps the whole image), or for none."
+        raise InputError(f"{source}: mask_path is given for some frames but not for {some(unmasked)}. {fix}")
 
 
 def check_unique(names: Iterable[Any], where: str) -> None:
@@ -100,10 +98,8 @@ def check_exist(paths: Sequence[Path], source: Path, what: str) -> None:
     """Check that every file exists; `what` is their kind."""
     missing = [path for path in paths if not os.path.isfile(path)]  # unlike Path's, False for a name too long
     if missing:
-        raise InputError(
-            f"{source}: {len(missing)} of {len(paths)} {what} are missing: {some(missing)}. Restore them, or correct "
-            "their paths (with the extension) or --downscale-factor."
-        )
+        fix = "Restore them, or correct their paths (with the extension) or --downscale-factor."
+        raise InputError(f"{source}: {len(missing)} of {len(paths)} {what} are missing: {some(missing)}. {fix}")
 
 
 def check_headers(paths: Sequence[Path], sizes: Sequence[tuple[int, int]], what: str, fix: str) -> None:

@@ -229,16 +229,10 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         """State of the order of training cameras, of plain numbers, lists and tuples."""
         generator = self.random_generator.getstate()
         unseen = list(self.train_unseen_cameras)
-        return {"num_images": len(self.train_dataset), "unseen_cameras": unseen, "generator": generator}
+        return {"unseen_cameras": unseen, "generator": generator}
 
     def load_sampling_state(self, state: dict[str, Any]) -> None:
-        """Continue the order of cameras from `sampling_state()`; InputError if the number of images is another, or the
-        order was not random, as it could be in older checkpoints."""
-        if (state["num_images"], state.get("strategy", "random")) != (len(self.train_dataset), "random"):
-            raise InputError(
-                f"{self.get_datapath()}: the checkpoint was trained on {state['num_images']} images, or in another "
-                f"order; now these are {len(self.train_dataset)}, at random. Continue with the same, or train anew."
-            )
+        """Continue the order of cameras from `sampling_state()` of the same images (`training/identity.py`)."""
         self.train_unseen_cameras = list(state["unseen_cameras"])
         version, words, gauss = state["generator"]
         self.random_generator.setstate((version, tuple(words), gauss))
@@ -287,10 +281,8 @@ def from_files(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
             with whole(path) as aside:
                 torch.save(kept, aside)
         except (OSError, RuntimeError) as error:  # torch raises RuntimeError where the disk is full
-            raise InputError(
-                f"{path} cannot be written ({error}). Make room there, set XDG_CACHE_HOME to another folder, or give "
-                "more --pipeline.datamanager.image-memory."
-            ) from error
+            fix = "Make room, set XDG_CACHE_HOME to another folder, or give more --pipeline.datamanager.image-memory."
+            raise InputError(f"{path} cannot be written ({error}). {fix}") from error
         kept = torch.load(path, mmap=True, weights_only=True)
     _set_lens(dataset.cameras, index, kept.pop("lens"))
     return {"image_idx": index, **kept}

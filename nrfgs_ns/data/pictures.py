@@ -130,10 +130,9 @@ def in_parallel(
     each = BYTES_PER_PIXEL * width * height
     free = free_memory()
     if each > free:
-        raise InputError(
-            f"Decoding an image of {width} x {height} takes about {each / 1e9:.1f} GB of memory, and {free / 1e9:.1f} "
-            "are free. Close other programs, or make the images and masks smaller."
-        )
+        takes = f"takes about {each / 1e9:.1f} GB of memory, and {free / 1e9:.1f} are free"
+        fix = "Close other programs, or make the images and masks smaller."
+        raise InputError(f"Decoding an image of {width} x {height} {takes}. {fix}")
     helpful = 4 + width * height // 250_000  # threads; more would wait for Python's lock between decodings
     workers = min(workers or min(os.cpu_count() or 1, helpful), free / (2 * each + 1))
     with ThreadPoolExecutor(max(int(workers), 1)) as pool:

@@ -76,10 +76,9 @@ class Web(_Format):
     def main(self) -> None:
         alone = self.output.suffix.lower() in (".html", ".htm")
         if self.output.exists() and self.output.is_file() != alone:
-            raise InputError(
-                f"--output {self.output} is a {'file' if self.output.is_file() else 'folder'}. Name a file that ends "
-                "in .html, or a folder that does not."
-            )
+            kind = "file" if self.output.is_file() else "folder"
+            fix = "Name a file that ends in .html, or a folder that does not."
+            raise InputError(f"--output {self.output} is a {kind}. {fix}")
         config = self.checked(self.output if alone else self.output / "index.html")
         check_compact(self.options)
         from nrfgs_ns.export.web.command import export_web

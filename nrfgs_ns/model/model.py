@@ -391,10 +391,8 @@ class NrfgsModel(ExportedModel):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         if state["densification"] != self.densification.name:
-            raise InputError(
-                f"The checkpoint was trained with --pipeline.model.densification {state['densification']}, this model "
-                f"with {self.densification.name}, which cannot go on from its statistics. Set it back, or train anew."
-            )
+            fix = f"{self.densification.name} cannot go on from its statistics. Set it back, or train anew."
+            raise InputError(f"The checkpoint has --pipeline.model.densification {state['densification']}; {fix}")
         self.densification.load_state(state["strategy"], self.device)
         self.num_views = state.get("views", self.num_train_data)
         self.near = state.get("near", 0.0)

@@ -32,10 +32,8 @@ class LeanOptimizers(Optimizers):
 
     def __init__(self, config, param_groups, steps_per_log: int = 10, pace: Pace | None = None):
         if missing := sorted(param_groups.keys() - config.keys()):
-            raise InputError(
-                f"The method has no optimizer for its head's {', '.join(missing)}. Register it with "
-                f"{missing[0]}=adam(LEARNING_RATE), as in docs/contributing.md."
-            )
+            fix = f"Register it with {missing[0]}=adam(LEARNING_RATE), as in docs/contributing.md."
+            raise InputError(f"The method has no optimizer for its head's {', '.join(missing)}. {fix}")
         super().__init__(config, param_groups)
         self.steps_per_log = steps_per_log
         self.pace = pace

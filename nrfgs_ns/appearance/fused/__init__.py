@@ -45,10 +45,8 @@ class FusedField:
             return False
         reason = self._why_not(splats)
         if reason is not None and self.config.implementation == "fused":
-            raise InputError(
-                f"pipeline.model.appearance.implementation is 'fused', but {reason}. "
-                "Set --pipeline.model.appearance.implementation auto or torch."
-            )
+            option = "pipeline.model.appearance.implementation"
+            raise InputError(f"{option} is 'fused', but {reason}. Set --{option} auto or torch.")
         return reason is None
 
     def _why_not(self, splats: Mapping[str, Tensor]) -> str | None:
