@@ -20,7 +20,6 @@ def manager(capture, parser_options=None, **options) -> NrfgsDatamanager:
     return NrfgsDatamanagerConfig(dataparser=dataparser, **options).setup(device="cpu")
 
 
-# Images.
 @pytest.mark.parametrize("scale", [1.0, 0.5])
 @pytest.mark.parametrize("mode", ["RGB", "RGBA", "L"])
 @pytest.mark.parametrize("kind", ["uint8", "float32"])

@@ -109,7 +109,6 @@ def test_empty_masks_are_named(tmp_path, printed):
         datamanager(capture).load_all_images()
 
 
-# Fisheyes.
 @pytest.mark.parametrize("k1", [0.0, 0.05])
 def test_a_fisheye_is_undistorted(tmp_path, k1):
     """What is in memory is what a pinhole sees of a world whose colour depends on direction."""

@@ -64,7 +64,6 @@ def test_mcmc_rests_before_its_start_and_after_its_end():
     assert len(table) == 52
 
 
-# Thresholds.
 def test_original_measures_by_the_cameras():
     """3DGS: 1.1 times the largest distance of a camera from the mean of all."""
     rules = strategy("original")

@@ -71,7 +71,6 @@ def one_by_one(cameras):
     return [cameras[index : index + 1] for index in range(len(cameras))]
 
 
-# The file.
 def test_layout_is_that_of_3dgs(tmp_path):
     splats = plain_splats(7)
     assert write_splats(splats, tmp_path / "deep" / "splats.ply") == 7

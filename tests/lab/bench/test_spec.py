@@ -30,7 +30,6 @@ def spec(**more):
     return make_spec({**SMALL, **more}, "test.yaml")
 
 
-# The file.
 def plans() -> dict[tuple[str, str], Spec]:
     """Each plan of the shipped files, by file and name."""
     result = {}
