@@ -53,7 +53,8 @@ def check_sight(xyz: torch.Tensor, cameras: Cameras, names: Sequence[str], sourc
     spread, away = ((places - middle).norm(dim=1).median() for places in (points, cameras.camera_to_worlds[:, :3, 3]))
     if spread <= LEAST_SPREAD * away:
         fix = "Make the points anew, or start from random ones with --load-3D-points False."
-        raise InputError(f"{source}: the {len(xyz)} points to start from are all at one place, or half of them are. {fix}")
+        finding = f"the {len(xyz)} points to start from are all at one place, or half of them are"
+        raise InputError(f"{source}: {finding}. {fix}")
     finding = f"{source}: {len(blind)} of {len(names)} training views see none of the {len(xyz)} points to start from"
     if len(blind) > MOST_BLIND * len(names):
         raise InputError(f"{finding}: {some(blind)}. {ONE_WORLD}")
