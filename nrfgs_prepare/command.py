@@ -182,8 +182,9 @@ class Run:
 
     def map(self) -> None:
         def find(advance: Advance) -> None:
-            enough = GOOD_SHARE * len(self.names)
-            models, mapping = structure.find_cameras(self.database, self.stored, self.model, enough, advance)
+            names = self.names
+            place = self.database, self.stored, self.model
+            models, mapping = structure.find_cameras(*place, names, GOOD_SHARE * len(names), advance)
             if models == 0:
                 raise InputError(
                     f"{self.options.photos}: photographs match, but no two of them are far enough apart to tell depth. "

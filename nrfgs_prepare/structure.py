@@ -8,7 +8,9 @@ import itertools
 import math
 import os
 import shutil
+import sqlite3
 import tempfile
+from contextlib import closing
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,6 +31,11 @@ SMALLEST_MODEL = 3
 """Minimum number of photographs of a model."""
 FEWEST_POINTS = 10
 """Minimum number of points per photograph of a globally mapped model."""
+RATIO, DOUBTFUL = 0.8, 0.9
+"""Largest distance of a feature's best match, in distances of its second best: usually, and of few photographs that are
+not all placed otherwise."""
+FEW = 30
+"""Photographs up to which a single one that is not placed is worth another try with all pairs."""
 SEED = 0
 BYTES_PER_FEATURE = 300
 """Room for a feature and its matches in the database."""
@@ -151,9 +158,13 @@ def positions(database: Path, names: list[str]) -> np.ndarray:
     return np.array([place if place.any() else (np.nan, np.nan) for place in places])  # a device without a fix: 0, 0
 
 
-def match_features(database: Path, names: list[str], pairs: Pairs, folder: Path, advance: Advance) -> int:
+def match_features(
+    database: Path, names: list[str], pairs: Pairs, folder: Path, advance: Advance, ratio: float = RATIO
+) -> int:
     """Match and verify pairs of photographs, and return the number of verified ones."""
     pycolmap = colmap()
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.sift.max_ratio = ratio
     listed = folder / "pairs.txt"
     pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
     verification = pycolmap.TwoViewGeometryOptions()
@@ -162,7 +173,7 @@ def match_features(database: Path, names: list[str], pairs: Pairs, folder: Path,
         part = pairs[first : first + PAIRS_AT_ONCE]
         listed.write_text("".join(f"{names[a]} {names[b]}\n" for a, b in part), encoding="utf-8")
         pycolmap.match_image_pairs(
-            database, pairing_options=pairing, verification_options=verification, device=pycolmap.Device.cpu
+            database, matching, pairing, verification_options=verification, device=pycolmap.Device.cpu
         )
         advance(len(part))
     with pycolmap.Database.open(database) as opened:
@@ -170,16 +181,24 @@ def match_features(database: Path, names: list[str], pairs: Pairs, folder: Path,
         return sum(number > 0 for number in inliers)
 
 
-def find_cameras(database: Path, photos: Path, folder: Path, enough: float, advance: Advance) -> tuple[int, str]:
+def find_cameras(
+    database: Path, photos: Path, folder: Path, names: list[str], enough: float, advance: Advance
+) -> tuple[int, str]:
     """Find cameras and points, and write the largest model to `folder`; the number of separate models (0: nothing is
     written) and the mapping.
 
-    Incremental mapping begins with two photographs from well separated places that share much, which a walk straight
-    ahead lacks. If it places fewer than `enough` photographs, global mapping, which solves for all positions at once,
-    is tried, too, and the larger model wins.
+    If few photographs are not all placed, all pairs are matched, with doubtful matches, too. Incremental mapping begins
+    with two photographs from well separated places that share much, which a walk straight ahead lacks. If it places
+    fewer than `enough` photographs, global mapping, which solves for all positions at once, is tried, too. The first
+    model with most photographs wins.
     """
     shutil.rmtree(folder, ignore_errors=True)
     models, mapping = _map_incrementally(database, photos, folder, advance), "incremental"
+    if _size(models)[0] < len(names) <= FEW:
+        with tempfile.TemporaryDirectory(dir=folder.parent) as place:
+            others = _map_incrementally(_match_more(database, names, Path(place)), photos, folder, lambda _: None)
+        if _size(others)[0] > _size(models)[0]:
+            models, mapping = others, "doubtful matches"
     if _size(models)[0] < enough:
         others = _map_globally(database, photos, folder)
         if _size(others)[0] > _size(models)[0]:
@@ -187,6 +206,20 @@ def find_cameras(database: Path, photos: Path, folder: Path, enough: float, adva
     if models:
         write_model(max(models, key=lambda model: _size([model])), folder)
     return len(models), mapping
+
+
+def _match_more(database: Path, names: list[str], place: Path) -> Path:
+    """A copy of the database in which all pairs are matched, with doubtful matches, too."""
+    copy = place / database.name
+    _check_room(place, 2 * database.stat().st_size, "further matches", "Make room, and run this again.")
+    with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(copy)) as target:
+        source.backup(target)
+    with colmap().Database.open(copy) as opened:
+        opened.clear_matches()
+        opened.clear_two_view_geometries()
+    pairs = list(itertools.combinations(range(len(names)), 2))
+    match_features(copy, names, pairs, place, lambda _: None, DOUBTFUL)
+    return copy
 
 
 def write_model(model: Any, folder: Path) -> None:

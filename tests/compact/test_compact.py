@@ -147,7 +147,6 @@ def test_a_file_alone_is_in_its_own_unit_of_length(tmp_path):
         load_file(tmp_path / "f.nrf")
 
 
-# The command.
 def compact(config: Path, output: Path, *words: str) -> dict:
     """What `nrfgs export compact` reports of the file that it writes."""
     report = output.with_suffix(".json")

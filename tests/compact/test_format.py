@@ -102,7 +102,6 @@ def test_a_cut_or_longer_file_is_noticed(data, written):
             read_container(broken)
 
 
-# Coded tables.
 @settings(max_examples=60)
 @given(
     st.integers(1, 4),

@@ -121,7 +121,6 @@ def test_undistorted_images_can_be_read_again(capture):
     assert data.train_dataset[0]["image"].shape == (9, 12, 3)
 
 
-# The order of cameras.
 def next_cameras(data, count: int) -> list[int]:
     return [data.next_train(0)[0].metadata["cam_idx"] for _ in range(count)]
 
@@ -140,7 +139,6 @@ def test_order_continues_after_a_restore(capture, tmp_path, steps):
     assert len(set(expected)) > 3
 
 
-# Where images are kept.
 @pytest.mark.parametrize("distorted", [False, True])
 def test_images_in_files_are_those_in_memory(capture, tmp_path, monkeypatch, printed, distorted):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

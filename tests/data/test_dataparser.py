@@ -58,7 +58,6 @@ def test_cameras_are_those_of_nerfstudio(capture, split, distortion):
     assert ours.dataparser_scale == theirs.dataparser_scale
 
 
-# Splits.
 @pytest.mark.parametrize("kept, other", [("val", {}), ("val", {"test_filenames": []}), ("test", {})])
 def test_val_and_test_stand_in_for_each_other_and_train_for_both(capture, printed, kept, other):
     path = [frame["file_path"] for frame in capture.meta["frames"]]
@@ -84,7 +83,6 @@ def test_one_image(tmp_path, printed, orientation, center):
     assert train.dataparser_scale == 1.0
 
 
-# Points.
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("kind", ["uchar", "int", "float", "none"])
 def test_ply(capture, printed, monkeypatch, text, kind):

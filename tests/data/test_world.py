@@ -68,7 +68,6 @@ def test_nerfstudio_leads_poses_back(tmp_path):
         np.testing.assert_allclose(pose, truth[path.name][:3], atol=1e-5, rtol=0)
 
 
-# What the cameras see.
 def turn_away(frame) -> None:
     frame["transform_matrix"] = (np.array(frame["transform_matrix"]) * [-1, 1, -1, 1]).tolist()
 

@@ -51,7 +51,6 @@ def test_noise_has_the_splats_shape_and_spares_what_is_visible():
     assert moved[2].abs().max() < 1e-6 < moved[1].abs().max()
 
 
-# What happens to the rows.
 def test_relocated_splats_become_copies_of_live_ones():
     table, dead = Table(50), torch.zeros(50, dtype=torch.bool)
     dead[::5] = True

@@ -20,7 +20,6 @@ from nrfgs_ns.host import gsplat_version
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
 
-# What happens to the rows.
 @pytest.mark.parametrize("name", STRATEGIES)
 def test_every_tensor_of_the_table_goes_along(name):
     """Small splats with large gradients are duplicated, large ones split, faint ones pruned or moved."""

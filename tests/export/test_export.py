@@ -109,7 +109,6 @@ def test_splats_that_cannot_be_drawn_are_left_out_also_of_a_turned_scene(tmp_pat
     assert write_splats(Y_DOWN.moved(splats), tmp_path / "splats.ply") == 3
 
 
-# The fit.
 def test_a_head_that_is_harmonics_is_fitted_exactly(tiny_scene, tmp_path, monkeypatch):
     model, cameras = model_on(tiny_scene, tmp_path, "nrfgs-sh")
     monkeypatch.setattr(SphericalHarmonics, "is_harmonics", False)  # it does not say so
@@ -221,7 +220,6 @@ def test_the_fine_tune_leaves_alone_what_is_right(tiny_scene, tmp_path, monkeypa
     assert squared_distance(model, fine_tune(model, fitted, cameras, 20), cameras) < (0.01 / 255) ** 2
 
 
-# The commands.
 @pytest.mark.parametrize("method", METHODS)
 def test_the_command_writes_the_splats_and_says_what_was_lost(method, trained, tmp_path):
     config, ours, report = trained[method], tmp_path / "ours.ply", tmp_path / "deep" / "report.json"
@@ -339,7 +337,6 @@ def test_mistakes_are_told_in_a_sentence(trained, tmp_path):
         Ply(lost, output=tmp_path / "s.ply").main()
 
 
-# The page.
 def test_a_page_holds_the_scene_and_the_photographs(trained, tmp_path):
     report = tmp_path / "report.json"
     Web(trained["nrfgs"], output=tmp_path / "a/tea.html", report=report, page=WebOptions(author="me")).main()

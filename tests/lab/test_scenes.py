@@ -79,7 +79,6 @@ def test_first_hit_is_the_nearest_surface_and_the_world_is_closed():
     np.testing.assert_allclose(t, distance, atol=1e-6)
 
 
-# The data set.
 MATT = SceneConfig(gloss=0.0, views=10, width=96, height=72, points=1500, samples=1)
 GLOSSY = SceneConfig(gloss=1.0, views=9, width=24, height=18, points=50)
 

@@ -218,14 +218,22 @@ def test_photographs_that_show_nothing_in_common_are_told(three, tmp_path):
         run_quietly(three, tmp_path / "out")
 
 
+def matches_in(database: Path) -> int:
+    with structure.colmap().Database.open(database) as opened:
+        return sum(opened.read_two_view_geometry_num_inliers()[1])
+
+
 def test_global_mapping_helps_out_and_finds_the_same(prepared, walls, tmp_path, monkeypatch):
-    """As where incremental mapping finds no two photographs to begin with: all straight ahead."""
-    monkeypatch.setattr(structure, "_map_incrementally", lambda *_: [])
+    """As where incremental mapping finds no two photographs to begin with, though all pairs are matched again with
+    doubtful matches, too: all straight ahead."""
+    tried = []
+    monkeypatch.setattr(structure, "_map_incrementally", lambda database, *_: tried.append(matches_in(database)) or [])
     out = shutil.copytree(prepared, tmp_path / "scene")
     shutil.rmtree(out / "work" / "model")
     assert "6 of 6 photographs" in run_quietly(walls, out)
     verdict, before = verdict_of(out), verdict_of(prepared)
     assert verdict["mapping"] == "global" and before["mapping"] == "incremental"
+    assert tried[1] > tried[0] > 0
     assert verdict["mean_reprojection_error_px"] < 1.2 * before["mean_reprojection_error_px"]
     check_walk(frames_of(out)[1])
 
@@ -413,6 +421,16 @@ def test_the_sharpest_frame_of_each_piece_of_a_video_is_taken(tmp_path):
 
 
 # The whole way, on real photographs.
+@pytest.mark.slow
+def test_few_photographs_are_all_placed(captures, tmp_path):
+    """Every second one of `kitchen`, which has 24 around a table: usual matches place fewer."""
+    names = sorted((captures / "kitchen" / "images").iterdir())[::2]
+    photographs = [shutil.copy(path, tmp_path) for path in names]
+    Prepare(tmp_path, tmp_path / "scene").main()
+    verdict = verdict_of(tmp_path / "scene")
+    assert verdict["registered"] == len(photographs) and verdict["mapping"] == "doubtful matches"
+
+
 @pytest.mark.slow
 def test_a_real_capture_is_recovered(captures, tmp_path):
     """Every second photograph of `fox` at two thirds of its size, against the poses that the capture came with."""

@@ -132,7 +132,6 @@ def test_many_random_scenes(case, dtype):
     check(case, dtype)
 
 
-# gsplat.
 RECORDED = Path(__file__).resolve().parents[1] / "fixtures" / "gsplat.npz"
 DENSE_FLOOR = 0.01
 """`MIN_DISCRIMINANT` of gsplat 1.4's dense kernel, which made the records."""

@@ -145,7 +145,6 @@ def test_peak_memory_is_bounded(size):
     assert float(subprocess.run(command, check=True, capture_output=True, text=True).stdout) < 1024
 
 
-# The lists.
 @pytest.mark.parametrize("name", [n for n in CASES if n not in ("nothing_visible", "near_plane")])
 def test_lists_are_complete_ordered_and_tight(name):
     """The ellipse can pass between pixel centres of a tile that it enters, so some pairs turn out empty. Never most of

@@ -55,7 +55,6 @@ def test_exposure_in_stops_of_exif_from_the_data_set_or_else_from_the_file(tmp_p
     assert exif_of([photo, tmp_path / "b.jpg"], [{}, {"iso": 50}]) == [{"exposure_time": 0.25}, {"iso": 50}]
 
 
-# Trainings.
 @pytest.fixture(scope="module")
 def exposed_scene(tmp_path_factory):
     """A procedural data set of 24 photographs, 128 x 96, with known stops, and those stops by name."""

@@ -187,7 +187,6 @@ def test_depth_is_dark_near_and_bright_far():
     assert drawn.scaled_depth(depth, 0 * opaque).abs().max() == 0
 
 
-# In nerfstudio's viewer.
 class Browser(RenderStateMachine):
     """One of the viewer's render threads, which renders one image as it would for a browser, and ends."""
 

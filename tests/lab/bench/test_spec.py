@@ -96,7 +96,6 @@ def test_a_preset_keeps_its_steps():
     assert PRESET_STEPS == {name: steps for name, steps in own.items() if steps != 30_000}
 
 
-# Commands.
 @pytest.mark.parametrize("strategy, built", [("own", ErrorGuided()), ("mcmc@7,stop_at=9", Mcmc(budget=7, stop_at=9))])
 def test_the_command_means_what_the_file_says(strategy, built, tiny_scene, tmp_path):
     runs = {"NRF": {"method": "nrfgs", "options": "--pipeline.model.appearance.latent-dim 9"}}
@@ -125,7 +124,6 @@ def test_fingerprints_ignore_paths_and_see_the_rest():
         assert differences(one, identity(spec(options=options), cell, None)) == f"options: {words}"
 
 
-# Data sets.
 def load(parser: list[str], method: str = "nrfgs"):
     """The data manager that ns-train would have, with all its images."""
     data = parse([method, *parser]).pipeline.datamanager.setup(device="cpu", test_mode="val")

@@ -58,7 +58,6 @@ def test_a_bare_step_moves_every_tensor(monkeypatch):
     assert all(not torch.equal(before[name], value) for name, value in bare.splats.items())
 
 
-# `nrfgs_lab.timing.fits`.
 def test_trainings_and_parts_are_measured_once(tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(scale, "WARM", 1)
     monkeypatch.setattr(scale, "PROFILED", 1)
@@ -86,7 +85,6 @@ def test_a_smaller_card_has_cuda_s_own_part_too(monkeypatch):
     assert shares == [11 / 80, 1.0]
 
 
-# `nrfgs_lab.timing.photographs`.
 def test_a_capture_is_made_and_read(tmp_path):
     make(tmp_path / "small", 10, 60, 40)
     Photographs(tmp_path / "out.json", data=(tmp_path / "small",)).main()
