@@ -184,7 +184,8 @@ class Run:
         def find(advance: Advance) -> None:
             names = self.names
             place = self.database, self.stored, self.model
-            models, mapping = structure.find_cameras(*place, names, GOOD_SHARE * len(names), advance)
+            enough, say = GOOD_SHARE * len(names), partial(self.screen.print, soft_wrap=True)
+            models, mapping = structure.find_cameras(*place, names, enough, advance, say)
             if models == 0:
                 raise InputError(
                     f"{self.options.photos}: photographs match, but no two of them are far enough apart to tell depth. "

@@ -10,6 +10,7 @@ import os
 import shutil
 import sqlite3
 import tempfile
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Literal
@@ -21,6 +22,7 @@ from nrfgs_ns.data.pictures import exif_of, open_picture, read_picture, read_siz
 from nrfgs_ns.errors import InputError
 from nrfgs_prepare.pairs import Advance, Pairs
 
+Say = Callable[[str], None]
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 
 LARGE = 1.5e6
@@ -182,10 +184,10 @@ def match_features(
 
 
 def find_cameras(
-    database: Path, photos: Path, folder: Path, names: list[str], enough: float, advance: Advance
+    database: Path, photos: Path, folder: Path, names: list[str], enough: float, advance: Advance, say: Say
 ) -> tuple[int, str]:
     """Find cameras and points, and write the largest model to `folder`; the number of separate models (0: nothing is
-    written) and the mapping.
+    written) and the mapping. A second try is announced.
 
     If few photographs are not all placed, all pairs are matched, with doubtful matches, too. Incremental mapping begins
     with two photographs from well separated places that share much, which a walk straight ahead lacks. If it places
@@ -195,6 +197,7 @@ def find_cameras(
     shutil.rmtree(folder, ignore_errors=True)
     models, mapping = _map_incrementally(database, photos, folder, advance), "incremental"
     if _size(models)[0] < len(names) <= FEW:
+        say(f"{_size(models)[0]} of {len(names)} photographs are placed. Trying again with more matches, for minutes.")
         with tempfile.TemporaryDirectory(dir=folder.parent) as place:
             others = _map_incrementally(_match_more(database, names, Path(place)), photos, folder, lambda _: None)
         if _size(others)[0] > _size(models)[0]:
