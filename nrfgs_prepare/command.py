@@ -90,11 +90,13 @@ class Run:
             self.work / name
             for name in ("photos", "database.db", "model", "undistorted", "likely_pairs.json", "state.json")
         )
-        self.verdict_file, self.source = self.out / "prepare.json", str(options.photos.resolve())
+        self.verdict_file = self.out / "prepare.json"
+        self.source = str(options.photos.resolve())
         ours = self.state_file.is_file() or self.verdict_file.is_file()
         if self.out.exists() and not ours and (self.out.is_file() or any(self.out.iterdir())):
             raise InputError(f"{self.out} exists and was not made by `nrfgs prepare`. Name a new or an empty folder.")
-        self.state, made = self._read(self.state_file), self._read(self.verdict_file)
+        self.state = self._read(self.state_file)
+        made = self._read(self.verdict_file)
         self.key = self.digest = files.digest(self.inputs)
         if made.get("digest", self.digest) != self.digest and (other := made.get("source")) != self.source:
             fix = "Name another folder, or delete this one."
@@ -184,7 +186,8 @@ class Run:
         def find(advance: Advance) -> None:
             names = self.names
             place = self.database, self.stored, self.model
-            enough, say = GOOD_SHARE * len(names), partial(self.screen.print, soft_wrap=True)
+            enough = GOOD_SHARE * len(names)
+            say = partial(self.screen.print, soft_wrap=True)
             models, mapping = structure.find_cameras(*place, names, enough, advance, say)
             if models == 0:
                 raise InputError(
