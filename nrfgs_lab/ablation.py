@@ -144,8 +144,7 @@ class FieldViews:
 def row(part: str, group: str, field: Field, views: FieldViews, full: float | None) -> Row:
     """Measure one field; `full` is the full field's PSNR, None for the full field."""
     score = views.psnr(field)
-    loss = 0.0 if full is None else full - score
-    return Row(part, group, score, loss, field.bytes, views.head_seconds(field))
+    return Row(part, group, score, 0.0 if full is None else full - score, field.bytes, views.head_seconds(field))
 
 
 def together(

@@ -14,15 +14,14 @@ RIVALS = {"3DGS's": ORIGINAL, "splatfacto's": "splatfacto", "MCMC's, 150,000 spl
 """Label -> strategy in results/default.json."""
 BETWEEN = "linear basis", "field without opacity residual", "linear basis with opacity residual", "field"
 RATES = {"harmonics, 4 times the rate": "4 times the rate", "16 times, decaying": "16 times the rate, decaying to one"}
-TRIED = RATES | {name: name for name in BETWEEN}
-HEADS = {label: [("rates: default", f"rates: {trial}")] for label, trial in TRIED.items()}
-HEADS["field"].append(("geometry of harmonics: default", "geometry: default"))
-"""Label -> harmonics and trial in results/trials.json, one pair for each seed."""
+HEADS = {label: [("rates: default", f"rates: {trial}")] for label, trial in (RATES | {n: n for n in BETWEEN}).items()}
+HEADS["field"] += [(f"{plan} of harmonics: default", f"{plan}: default") for plan in ("geometry", "ridge")]
+"""Label -> harmonics and trial, one pair for each seed."""
 GAPS = {
     "**twice the residual, on the logit**: `nrfgs`": [("gaps: default", "gaps: twice on the logit")],
     "harmonics without noise": [("gaps: default", "gaps: harmonics")],
 }
-"""Label -> trials with gaps in results/trials.json; their default added the residual to the opacity."""
+"""Label -> trials with gaps; their default added the residual to the opacity."""
 
 
 def default() -> str:
@@ -57,7 +56,7 @@ def rivals() -> str:
 
 def _changes(sides: list[tuple[str, str]]) -> dict[str, tuple[float, float, float]]:
     """Changes from a default to a trial, same seeds, by capture: PSNR, SSIM, share of splats."""
-    runs = {(one["name"], one["scene"], one.get("seed")): one for one in records("trials").values()}
+    runs = {(one["name"], one["scene"], one.get("seed")): one for one in records("trials", "geometry").values()}
     pairs = defaultdict(list)
     for (name, scene, seed), one in runs.items():
         for default, trial in sides:
@@ -79,17 +78,18 @@ def changes(trials: dict[str, list[tuple[str, str]]]) -> str:
     return grid(["", *VIEWS, "splats"], body)
 
 
-def trial_changes(sitting: str, best: int | None = None) -> str:
-    """Mean changes by a sitting's trials, or its best ones, dB with standard errors over splits."""
-    runs, changes = records("trials"), defaultdict(list)
+def trial_changes(sitting: str, best: int | None = None, only: str = "") -> str:
+    """Mean changes by a sitting's trials, its best ones or one of them, dB with standard errors over splits."""
+    runs, changes = records("trials", "geometry"), defaultdict(list)
     for key, one in runs.items():
         at, _, trial = one.get("name", "").partition(": ")
         base = runs.get(key.replace(trial, "default", 1)) if at == sitting else None
-        if base and base is not one:
+        if base and base is not one and only in ("", trial):
             changes[trial].append(one["psnr"] - base["psnr"])
     texts = []
     for name, dB in sorted(changes.items(), key=lambda one: -fmean(one[1]))[:best]:
-        texts.append(f"{name} {signed(fmean(dB), 2)}" + (f"±{stdev(dB) / len(dB) ** 0.5:.2f}" if len(dB) > 1 else ""))
+        spread = f"±{stdev(dB) / len(dB) ** 0.5:.2f}" if len(dB) > 1 else ""
+        texts.append(("" if only else f"{name} ") + signed(fmean(dB), 2) + spread)
     return "; ".join(texts)
 
 
@@ -136,6 +136,8 @@ BLOCKS = {
     "tables.watched": watched,
     "tables.geometry": lambda: trial_changes("geometry", best=1),
     "tables.geometry_of_harmonics": lambda: trial_changes("geometry of harmonics", best=1),
+    "tables.ridge": lambda: trial_changes("ridge", only="scales twice"),
+    "tables.ridge_of_harmonics": lambda: trial_changes("ridge of harmonics", only="scales twice"),
     "tables.heads": lambda: changes(HEADS),
     "tables.scale": scale,
 }

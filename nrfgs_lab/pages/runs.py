@@ -31,10 +31,10 @@ Trainings = list[dict[str, Any]]
 
 
 @cache
-def records(study: str) -> dict[str, Any]:
-    """The records of results/STUDY.json."""
-    content = json.loads((ROOT / "results" / f"{study}.json").read_text(encoding="utf-8"))
-    return content.get("records", content)
+def records(*studies: str) -> dict[str, Any]:
+    """The records of results/STUDY.json of one or more studies."""
+    contents = (json.loads((ROOT / "results" / f"{study}.json").read_text(encoding="utf-8")) for study in studies)
+    return {name: record for content in contents for name, record in content.get("records", content).items()}
 
 
 @cache

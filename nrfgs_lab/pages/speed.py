@@ -33,8 +33,7 @@ def scale_ratios() -> str:
 
 def scale_fit(column: str, factor: str, unit: str, renderer: str) -> str:
     """Least squares of a quantity by splats and pixels."""
-    places = scale_cells(column).items()
-    cells = {place: float(factor) * median(cell[renderer]) for place, cell in places}
+    cells = {place: float(factor) * median(cell[renderer]) for place, cell in scale_cells(column).items()}
     parts = np.linalg.lstsq([[1, count / 1e6, pixels] for count, pixels in cells], [*cells.values()], rcond=None)[0]
     return f"{parts[0]:.1f} {unit}, {parts[1]:.1f} for each million splats and {parts[2]:.2f} for each megapixel"
 

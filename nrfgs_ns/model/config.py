@@ -41,12 +41,6 @@ class NrfgsModelConfig(ModelConfig):
     shrinkage: float = 0.0
     """weight in the loss of the splats' mean opacity and mean size, in percent, halved for every 12 training views
     (docs/captures.md)"""
-    residual_l2: float = 0.0
-    """weight of the mean square of the visible splats' residuals of colour and opacity"""
-    residual_l1: float = 0.0
-    """weight of their mean absolute value"""
-    residual_views: float = 0.0
-    """training views with which these weights fall to one half, as V0 / (V + V0); 0: they stay"""
     dense_start: Literal["auto", "off"] = "off"
     """auto: start with points from the photographs, too, the more the fewer there are (docs/captures.md)"""
     near_plane: Literal["auto", "off"] = "off"

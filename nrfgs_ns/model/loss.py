@@ -24,8 +24,6 @@ def loss_of(model, splats: Mapping[str, Tensor], outputs: Mapping[str, Any], bat
     losses = {"main_loss": photometric(model, outputs, batch)}
     if model.training:
         model.camera_optimizer.get_loss_dict(losses)
-        if "residual" in outputs:
-            losses["residual"] = outputs["residual"]
         losses |= model.densification.regularisation(splats) | shrinkage(model, splats)
     return losses
 

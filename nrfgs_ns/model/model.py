@@ -249,30 +249,7 @@ class NrfgsModel(ExportedModel):
                 base = torch.sigmoid(stored).flatten()  # for splats that are not visible
                 shown = torch.where(info["radii"] > 0, shown, base)
             self.densification.pre_backward(self.step, info, shown, stored)
-            outputs = outputs | self.residual_loss(view, appearance, noisy, info)
         return outputs, info
-
-    def residual_loss(self, view: View, appearance: SplatAppearance, noisy: Field, info) -> dict[str, Tensor]:
-        config = self.config
-        l1, l2 = config.residual_l1, config.residual_l2
-        if not (l1 or l2):
-            return {}
-        if config.residual_views:
-            share = config.residual_views / (self.num_views + config.residual_views)
-            l1, l2 = l1 * share, l2 * share
-        base = self.head.base_appearance(noisy.splats, view.visible)
-        change = torch.cat(
-            [appearance.colors - base.colors, (appearance.opacities - base.opacities)[:, None]], dim=-1
-        )
-        if view.every_row:
-            shown = (info["radii"] > 0).reshape(-1, 1).to(change.dtype)
-        else:
-            shown = torch.ones_like(change[:, :1])
-        count = shown.sum().clamp_min(1.0) * 4
-        loss = l2 * (change.square() * shown).sum() / count
-        if l1:
-            loss = loss + l1 * ((change.square() + 1e-6).sqrt() * shown).sum() / count
-        return {"residual": loss}
 
     def composite(
         self,
