@@ -20,7 +20,7 @@ from nerfstudio.utils.colors import get_color
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
-from nrfgs_ns.appearance.head import AppearanceHeadConfig, Field, SplatAppearance, ViewNoise, check_head, failures_told
+from nrfgs_ns.appearance.head import AppearanceHeadConfig, Field, SplatAppearance, ViewNoise, check_head, located_errors
 from nrfgs_ns.data.checks import warn
 from nrfgs_ns.data.views import camera_spacing
 from nrfgs_ns.densification import Densification
@@ -73,7 +73,7 @@ class NrfgsModel(ExportedModel):
         """Depth from which `near_plane` auto draws splats, in world units; a checkpoint keeps its training's."""
         config.appearance.validate()
         self._seed = torch.initial_seed()
-        with failures_told(config.appearance):
+        with located_errors(config.appearance):
             self.head = config.suited_appearance(self.num_views).setup(self.scene_unit)
             splats = self._initial_splats()
             check_head(self.head, splats)
