@@ -273,11 +273,8 @@ def located_errors(config: AppearanceHeadConfig) -> Iterator[None]:
 
 @torch.no_grad()
 def check_head(head: AppearanceHead, splats: Mapping[str, Tensor]) -> None:
-    """Raise InputError where a head breaks its contract, given its initial table.
-
-    `forward` runs on a table with two more rows, copies of a splat, and on these two: a head with a table of its own,
-    which densification could not extend, fails here.
-    """
+    """Raise InputError where a head breaks its contract, given its initial table. `forward` sees two more rows, copies
+    of a splat: a head with a table of its own, which densification could not extend, fails here."""
     head_class = f"{type(head).__module__}.{type(head).__name__}"
     count = len(splats["means"])
 
@@ -285,8 +282,8 @@ def check_head(head: AppearanceHead, splats: Mapping[str, Tensor]) -> None:
         if value.dtype != torch.float32 or value.shape != shape or not value.isfinite().all():
             actual = f"{str(value.dtype).removeprefix('torch.')} {[*value.shape]}"
             actual += "" if value.isfinite().all() else ", not all finite"
-            needed = f"{subject} must be finite float32 {[*shape]}"
-            raise InputError(f"{head_class}: {needed}, but is {actual}. Correct it there.")
+            needed = f"finite float32 {[*shape]}"
+            raise InputError(f"{head_class}: {subject} must be {needed}, but is {actual}. Correct it there.")
 
     if not isinstance(getattr(head, "name", None), str):
         raise InputError(

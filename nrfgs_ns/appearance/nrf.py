@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The neural residual field: one tiny network, shared by the scene, that adds a bounded residual to every splat.
 
-Splat i stores a base colour c, a base opacity alpha and a latent z. A camera centre o sees its mean x along
+Splat i stores a mean x, a base colour c, a base opacity alpha and a latent z. For a camera centre o let
 
-    v = o - x,    r = max(|v|, eps),    d = v / r.
+    v = o - x,    r = max(|v|, eps),    d = v / r,
 
-With the Fourier bands of d, d itself and sin(2^k pi d), cos(2^k pi d) for k < K, split into low(d), which is d and band
-0, and high(d):
+low(d) be d and its Fourier band 0, and high(d) bands 1 to K - 1; band k is sin(2^k pi d) and cos(2^k pi d). Then
 
     (dc_low, d_alpha) = low branch (z, c, alpha, log r, low(d))
     (dc_high, w)      = high branch(z, c,        log r, high(d))
@@ -18,9 +17,9 @@ The gate w lets detail through only where it pays. Both branches are one hidden 
 48 -> 64 -> 4, 6,664 weights at the default sizes. Without the split, one branch of twice the width sees everything
 (58 -> 128 -> 4, 8,068 weights), without a gate.
 
-Two bounds keep opacity in [0, 1], with t = tanh(d_alpha) and x = alpha + s_alpha t:
+Two bounds keep opacity in [0, 1], with t = tanh(d_alpha) and a = alpha + s_alpha t:
 
-    straight-through   min(max(x, 0), 1), with the gradient of x, so that a splat beyond an end can come back
+    straight-through   min(max(a, 0), 1), with the gradient of a, so that a splat beyond an end can come back
     logit              sigmoid(logit + 4 s_alpha t); at half opacity, to first order, alpha + s_alpha t
 
 On the logit the residual scales with the opacity: n copies of a splat, each of about alpha / n, together look like one.
@@ -207,10 +206,8 @@ class NeuralResidualField(AppearanceHead):
         low, high = fourier_bands(directions, self.config.num_bands)
 
         shared = [latents, color] + ([log_distance] if self.config.use_distance else [])
-        low_inputs = [*shared, torch.sigmoid(logit), low]
-        if not self.config.split_bands:  # the only branch sees all bands
-            low_inputs.append(high)
-        low_outputs = self.low(torch.cat(low_inputs, dim=-1))
+        bands = [low] if self.config.split_bands else [low, high]  # a single branch sees all
+        low_outputs = self.low(torch.cat([*shared, torch.sigmoid(logit), *bands], dim=-1))
         dc_low = low_outputs[:, :3]
         d_alpha = low_outputs[:, 3:] if self.config.opacity_residual else None
         dc_high = gate = None
@@ -278,5 +275,5 @@ def bounded_opacity(logit: Tensor, residual: Tensor, scale: float, bound: Opacit
     """
     if bound == "logit":
         return torch.sigmoid(logit + LOGIT_SLOPE * scale * residual)
-    x = torch.sigmoid(logit) + scale * residual
-    return x + (x.clamp(0.0, 1.0) - x).detach()
+    unbounded = torch.sigmoid(logit) + scale * residual
+    return unbounded + (unbounded.clamp(0.0, 1.0) - unbounded).detach()

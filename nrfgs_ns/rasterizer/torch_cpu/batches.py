@@ -170,15 +170,8 @@ def expand_around_centres(canvas: Canvas, lists: TileLists, centres: Tensor, pai
 
 
 def group_by_count(remaining: Tensor, tiles: Tensor, pixels: int) -> list[tuple[Tensor, int]]:
-    """Cut tiles [L] into groups of similar counts that fit into a batch.
-
-    Args:
-        remaining: the tiles' numbers of splats in this slab, descending. [L]
-        pixels: P, pixels of a tile.
-
-    Returns:
-        pairs: the tiles of a group, and the largest of their counts.
-    """
+    """Cut tiles [L] with `remaining` splats in this slab, [L] and descending, into groups of similar counts that fit
+    into a batch: pairs of a group's tiles and their largest count."""
     counts = remaining.tolist()
     groups = []
     begin = 0

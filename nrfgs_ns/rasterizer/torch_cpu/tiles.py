@@ -150,8 +150,6 @@ def split_into_blocks(footprints: Footprints, max_pairs: int) -> list[Block]:
 
     def split(block: Block) -> list[Block]:
         row0, row1, col0, col1 = block
-        if row0 >= row1 or col0 >= col1:
-            return []
         clipped = _clip(footprints.spans, block)
         pairs = ((clipped[1] - clipped[0]) * (clipped[3] - clipped[2])).sum()
         if pairs <= max_pairs or (row1 - row0 == 1 and col1 - col0 == 1):
