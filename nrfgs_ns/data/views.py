@@ -110,14 +110,15 @@ def camera_spacing(centers: Tensor) -> float:
 
 
 def _in_reaches(centers: Tensor) -> np.ndarray:
-    """Camera centres [V, 3] about their mean, in distances from there to the farthest."""
-    away = centers.double().cpu().numpy()
-    away = away - away.mean(axis=0)
-    return away / np.linalg.norm(away, axis=1).max(initial=1e-300)
+    """Camera centres [V, 3] relative to their mean, in units of the largest distance from it."""
+    centers = centers.double().cpu().numpy()
+    offsets = centers - centers.mean(axis=0)
+    return offsets / np.linalg.norm(offsets, axis=1).max(initial=1e-300)
 
 
 def _first_of_each(rows: np.ndarray) -> list[int]:
-    """Indices of rows [V, K] that are not near an earlier one. Near linear: few of the rows kept find the same row."""
+    """Indices of rows [V, K] not within `SAME_PLACE` of an earlier one. Near linear: few kept rows find the same
+    row."""
     from scipy.spatial import cKDTree
 
     kept = []

@@ -187,8 +187,8 @@ class Densification(ABC):
     def pre_backward(self, step: int, info: dict[str, Any], opacities: Tensor, logits: Tensor) -> None:
         """Look at a training view before the loss goes backward.
 
-        For recorded steps (`training/step_graph.py`) it runs once, while they are recorded: every splat has a row, of
-        radius 0 where it is invisible, and each step refills the tensors in `info`.
+        For recorded steps (`training/step_graph.py`) it runs once, in the recording: every splat has a row, of radius 0
+        where it is invisible, and each step refills the tensors in `info`.
 
         Args:
             step: training step.
@@ -228,9 +228,9 @@ class Densification(ABC):
     def room_for(self, step: int, info: Mapping[str, Any], splats: Splats, optimizers: Optimizers, wanted: int) -> int:
         """How many of `wanted` more splats the GPU has memory for. Every refinement that may grow asks, on all devices.
 
-        Once it is fewer, and the limit near, growth ends there, and a line says so. The limit is in checkpoints, so
-        that a continued training has the same one, unless it is allowed more memory, or less. While the limit is not
-        near, memory may only slow growth, which a continued training need not repeat to the bit.
+        Once it is fewer, and the limit near, growth ends there, and a line says so. The limit is in checkpoints: a
+        continued training has the same one, unless it is allowed another amount of memory. While the limit is not near,
+        memory only slows growth, which a continued training need not repeat to the bit.
         """
         count = len(splats["means"])
         allowed = self.minimum_of_devices(memory.allowed(splats["means"].device))

@@ -122,10 +122,8 @@ class LeanOptimizers(Optimizers):
 
 
 def step_at_once(optimizers: Sequence[Adam]) -> bool:
-    """Make one step of several fused Adams that have state by one Triton kernel, if it runs; returns whether it did.
-
-    As in torch, the step changes nothing where the optimisers' `found_inf`, a tensor on the device, is 1.
-    """
+    """Make one step of several fused Adams that have state by one Triton kernel, if it runs; returns whether it did. As
+    in torch, the step changes nothing where the optimisers' `found_inf`, a tensor on the device, is 1."""
     work: list[tuple[dict[str, Any], list[Tensor], list[dict[str, Tensor]]]] = []
     for optimizer in optimizers:
         for group in optimizer.param_groups:
