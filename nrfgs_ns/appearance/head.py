@@ -25,7 +25,7 @@ from nrfgs_ns.errors import InputError
 
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi))."""
-NEAREST = 0.01
+NEAR = 0.01
 """Smallest camera distance, in scene units: the near plane, closer than which nothing is drawn."""
 
 
@@ -275,34 +275,30 @@ def located_errors(config: AppearanceHeadConfig) -> Iterator[None]:
 def check_head(head: AppearanceHead, splats: Mapping[str, Tensor]) -> None:
     """Raise InputError where a head breaks its contract, given its initial table. `forward` sees two more rows, copies
     of a splat: a head with a table of its own, which densification could not extend, fails here."""
-    head_class = f"{type(head).__module__}.{type(head).__name__}"
+    where = f"{type(head).__module__}.{type(head).__name__}"
     count = len(splats["means"])
 
-    def require(subject: str, value: Tensor, *shape: int) -> None:
+    def require(part: str, value: Tensor, *shape: int) -> None:
         if value.dtype != torch.float32 or value.shape != shape or not value.isfinite().all():
             actual = f"{str(value.dtype).removeprefix('torch.')} {[*value.shape]}"
             actual += "" if value.isfinite().all() else ", not all finite"
-            needed = f"finite float32 {[*shape]}"
-            raise InputError(f"{head_class}: {subject} must be {needed}, but is {actual}. Correct it there.")
+            raise InputError(f"{where}: {part} must be finite float32 {[*shape]}, but is {actual}. Correct it there.")
 
     if not isinstance(getattr(head, "name", None), str):
-        raise InputError(
-            f'{head_class} has no name, which checkpoints need. Give the class one, such as name = "mine".'
-        )
+        raise InputError(f'{where} has no name, which checkpoints need. Give the class one, such as name = "mine".')
     for name, value in splats.items():
         require(f"{name!r} of splat_params", value, count, *value.shape[1:])
     if count == 0:
         return
     table = {name: value[:1].expand(count + 2, *value.shape[1:]).contiguous() for name, value in splats.items()}
-    appearance = head(table, torch.arange(count, count + 2), splats["means"][0] + head.scene_unit)
-    if not isinstance(appearance, SplatAppearance):
-        kind = type(appearance).__name__
-        raise InputError(f"{head_class}: forward returns a {kind}. Let it return SplatAppearance(colors, opacities).")
-    colors, opacities = appearance
-    require("opacities of forward, for two splats,", opacities, 2)
-    require("colors of forward, for two splats,", colors, 2, colors.shape[-1] if head.at_pixel else 3)
+    result = head(table, torch.arange(count, count + 2), splats["means"][0] + head.scene_unit)
+    if not isinstance(result, SplatAppearance):
+        kind = type(result).__name__
+        raise InputError(f"{where}: forward returns a {kind}. Let it return SplatAppearance(colors, opacities).")
+    require("opacities of forward, for two splats,", result.opacities, 2)
+    require("colors of forward, for two splats,", result.colors, 2, result.colors.shape[-1] if head.at_pixel else 3)
     if head.at_pixel:
-        features = colors[0].repeat(16, 16, 1)
+        features = result.colors[0].repeat(16, 16, 1)
         rays = torch.tensor([0.0, 0.0, 1.0]).repeat(16, 16, 1)
         require("what image_of makes of 16 x 16 pixels", head.image_of(features, rays), 16, 16, 3)
 

@@ -29,20 +29,13 @@ On the logit the residual scales with the opacity: n copies of a splat, each of 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, get_args, get_type_hints
 
 import torch
 from torch import Tensor, nn
 
 from nrfgs_ns.appearance.fused import FusedField
-from nrfgs_ns.appearance.head import (
-    NEAREST,
-    AppearanceHead,
-    AppearanceHeadConfig,
-    Component,
-    SplatAppearance,
-    base_colors,
-)
+from nrfgs_ns.appearance.head import NEAR, AppearanceHead, AppearanceHeadConfig, Component, SplatAppearance, base_colors
 
 OpacityBound = Literal["straight-through", "logit"]
 OPACITY_BOUNDS: tuple[OpacityBound, ...] = get_args(OpacityBound)
@@ -77,7 +70,7 @@ class NrfConfig(AppearanceHeadConfig):
     """largest change of a colour channel (s_c), in units of white"""
     opacity_scale: float = 0.2
     """largest change of opacity (s_alpha); twice this with error-guided and mcmc, unless `opacity_bound` is given"""
-    distance_eps: float = NEAREST
+    distance_eps: float = NEAR
     """smallest camera distance, in scene units; shorter ones count as this. The near plane"""
     output_init: Literal["zero", "default"] = "zero"
     """start of the output layers. zero: no residual. default: torch's, as in the paper, followed by the warm-up"""
@@ -110,12 +103,9 @@ class NrfConfig(AppearanceHeadConfig):
         for name in ("color_scale", "opacity_scale"):
             self.require(getattr(self, name) >= 0, name, "zero or positive")
         self.require(self.distance_eps > 0, "distance_eps", "positive")
-        for name, choices in (
-            ("output_init", ("zero", "default")),
-            ("opacity_bound", (None, *OPACITY_BOUNDS)),
-            ("implementation", ("auto", "torch", "fused")),
-            ("precision", ("fp32", "tf32", "bf16", "fp16")),
-        ):
+        hints = get_type_hints(NrfConfig)
+        literals = {name: get_args(hints[name]) for name in ("output_init", "implementation", "precision")}
+        for name, choices in {**literals, "opacity_bound": (None, *OPACITY_BOUNDS)}.items():
             self.require(getattr(self, name) in choices, name, "one of " + ", ".join(map(repr, choices)))
 
 

@@ -228,9 +228,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
 
     def sampling_state(self) -> dict[str, Any]:
         """State of the order of training cameras, of plain numbers, lists and tuples."""
-        generator = self.random_generator.getstate()
-        unseen = list(self.train_unseen_cameras)
-        return {"unseen_cameras": unseen, "generator": generator}
+        return {"unseen_cameras": list(self.train_unseen_cameras), "generator": self.random_generator.getstate()}
 
     def load_sampling_state(self, state: dict[str, Any]) -> None:
         """Continue the order of cameras from `sampling_state()` of the same images (`training/identity.py`)."""

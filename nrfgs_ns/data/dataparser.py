@@ -175,10 +175,9 @@ class NrfgsDataParser(DataParser):
         if named and "train" not in named:
             given, _ = next(iter(named.values()))  # such as test_filenames or test_list.txt
             raise InputError(f"{source} has {given}, but no train_{given.partition('_')[2]}. Name the training images.")
-        if named:
-            splits = split_by_names(named, paths, self._file, source)
-        else:
-            splits = split_by_rule(self.config, paths, source)
+        splits = (
+            split_by_names(named, paths, self._file, source) if named else split_by_rule(self.config, paths, source)
+        )
         if not len(splits["train"]):
             raise InputError(f"{source}: no image left for training. Correct train_filenames or --eval-mode's options.")
         return splits

@@ -117,8 +117,7 @@ def _in_reaches(centers: Tensor) -> np.ndarray:
 
 
 def _first_of_each(rows: np.ndarray) -> list[int]:
-    """Indices of rows [V, K] not within `SAME_PLACE` of an earlier one. Near linear: few kept rows find the same
-    row."""
+    """Indices of rows [V, K] not within `SAME_PLACE` of an earlier one, in almost linear time."""
     from scipy.spatial import cKDTree
 
     kept = []

@@ -29,7 +29,7 @@ from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 from torch.nn import Parameter
 
-from nrfgs_ns.densification.statistics import Statistics, update_statistics
+from nrfgs_ns.densification.statistics import Statistics, accumulate
 from nrfgs_ns.densification.strategy import CHANGE, Densification, DensificationConfig, OpacitySeen, Optimizers, Splats
 
 ERROR = "error"
@@ -121,11 +121,9 @@ class ErrorGuidedDensification(Densification):
     def _update_statistics(self, step: int, info: Mapping[str, Any], count: int) -> None:
         """Let the window's maxima be at least the step's; errors only while splats grow."""
         self.make_tables((ERROR, WIDTH, CHANGE), count, info["radii"].device)
-        error = gradients = None
-        if step < self.grow_until:
-            error, gradients = self.state[ERROR], info["means2d"].absgrad
-        tables = Statistics(self.state[WIDTH], error, self.state.get(CHANGE))
-        update_statistics(tables, info, 1.0, gradients, info.get("change"))
+        grows = step < self.grow_until
+        tables = Statistics(self.state[WIDTH], self.state[ERROR] if grows else None, self.state.get(CHANGE))
+        accumulate(tables, info, 1.0, info["means2d"].absgrad if grows else None, info.get("change"))
 
     # What a refinement does.
 

@@ -11,7 +11,7 @@ from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import remove, reset_opa
 from torch import Tensor
 
-from nrfgs_ns.densification.statistics import Statistics, update_statistics
+from nrfgs_ns.densification.statistics import Statistics, accumulate
 from nrfgs_ns.densification.strategy import Densification, DensificationConfig
 
 EXTENT_MARGIN = 1.1
@@ -178,8 +178,7 @@ class GradientDensification(Densification):
         means2d = info["means2d"]
         gradients = means2d.absgrad if self.strategy.absgrad else means2d.grad
         self.make_tables(("grad2d", "count", "radii"), count, gradients.device)
-        tables = Statistics(state.get("radii"), state["grad2d"], state["count"])
-        update_statistics(tables, info, 2.0, gradients, sums=True)
+        accumulate(Statistics(state.get("radii"), state["grad2d"], state["count"]), info, 2.0, gradients, sums=True)
 
     def _refine(self, step: int, info: Mapping[str, Any], splats, optimizers) -> None:
         """Grow and prune by gsplat's rules, and begin the statistics anew."""

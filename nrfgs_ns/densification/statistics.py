@@ -39,7 +39,7 @@ class Step(NamedTuple):
     """factors in x and y of the gradients, which come by a centre's position in pixels"""
 
 
-def update_statistics(
+def accumulate(
     tables: Statistics,
     info: Mapping[str, Any],
     extent: float,
@@ -73,7 +73,7 @@ def update_statistics(
 
 
 def in_torch(tables: Statistics, step: Step, gradients: Tensor | None, change: Tensor | None, sums: bool) -> None:
-    """`update_statistics` in PyTorch, the kernel's twin."""
+    """`accumulate` in PyTorch, the kernel's twin."""
     (widths, norms, counts_or_changes), (rows, radii, side, scales) = tables, step
     seen = radii > 0
     if widths is not None:

@@ -247,8 +247,7 @@ class Densification(ABC):
             if self.verbose:
                 held = f"growth is held at {most:,} splats a GPU, since its memory has no room for more"
                 print(f"Step {step}: {held}. Smaller images or more GPUs make room (docs/troubleshooting.md).")
-        limit, _ = self.state[GROWTH_LIMIT]
-        return min(wanted, max(limit - count, 0))
+        return min(wanted, max(self.state[GROWTH_LIMIT][0] - count, 0))
 
     def planned_count(self, step: int, count: int, start: int, stop: int) -> float:
         """The number of splats that a training with a budget should have after a refinement between the steps `start`

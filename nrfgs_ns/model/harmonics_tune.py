@@ -20,9 +20,7 @@ from nrfgs_ns.model.harmonics_fit import DEGREE, PlainSplats, no_larger
 from nrfgs_ns.progress import progress
 from nrfgs_ns.rasterizer import View, composite_view
 
-STEPS = 2500
-STEPS_OF_A_VIEW = 10
-STEPS_ON_A_CPU = 400
+STEPS, STEPS_ON_A_CPU, STEPS_OF_A_VIEW = 2500, 400, 10
 """Steps, of one view each. A GPU takes seconds; a CPU makes STEPS_OF_A_VIEW for each view, at most STEPS_ON_A_CPU."""
 RATES = {"opacities": 3.0, "features_dc": 0.15, "features_rest": 0.15}
 """Initial learning rates, times the root mean square difference of the pictures: Adam's steps do not shrink with it.

@@ -267,9 +267,8 @@ def composite(
     render, alphas, lists = backend.composite(projection, colors, opacities, backgrounds, absgrad, leave_out)
     if with_depth:
         render = torch.cat([render[..., :-1], render[..., -1:] / alphas.clamp(min=1e-10)], dim=-1)
-    names = "camera_ids", "gaussian_ids", "radii", "means2d", "depths", "conics", "width", "height", "n_cameras"
-    info = {name: getattr(projection, name) for name in names} | {"opacities": opacities, "tile_size": TILE_SIZE}
-    info |= lists  # perhaps with another tile size
+    keys = "camera_ids", "gaussian_ids", "radii", "means2d", "depths", "conics", "width", "height", "n_cameras"
+    info = {key: getattr(projection, key) for key in keys} | {"opacities": opacities, "tile_size": TILE_SIZE} | lists
     info |= {f"tile_{side}": -(-info[side] // info["tile_size"]) for side in ("width", "height")}
     return render, alphas, info
 

@@ -187,10 +187,9 @@ class NrfgsPipeline(VanillaPipeline):
                 save_image(picture.permute(2, 0, 1).cpu(), file)
         self.train()
 
-        result = means_of(per_image, get_std)
         seconds = fmean(image["seconds_per_image"] for image in per_image[1:] or per_image)
-        result |= {"seconds_per_image": seconds, "fps": 1.0 / seconds, "splats": self.model.num_splats}
-        result["parameter_bytes"] = self.model.parameter_bytes
+        result = means_of(per_image, get_std) | {"seconds_per_image": seconds, "fps": 1.0 / seconds}
+        result |= {"splats": self.model.num_splats, "parameter_bytes": self.model.parameter_bytes}
         if get_std:
             result["per_image"] = per_image
             print_evaluation(result)

@@ -51,9 +51,9 @@ class StepGraphs:
         self.model, self.datamanager, self.guard = model, datamanager, guard
         self._graphs: dict[tuple, _StepGraph] = {}
         self._recorded: list[Any] = []
-        """the splats' parameters and the head that the graphs hold"""
+        """the splats' parameters and the head that the graphs hold, kept so that their ids stay theirs"""
         self._settings: dict[str, Any] = {}
-        """what else the graphs depend on: phases, places in memory, the resolution"""
+        """what the graphs depend on: ids of those objects, their places in memory, phases, the resolution"""
         self._pairs_per_splat = 0.0
         """the most pairs of a view at this resolution, divided by the number of splats"""
         self._pool_and_stream: tuple = ()
@@ -78,9 +78,9 @@ class StepGraphs:
     def _obstacle(self, batch: Mapping[str, Any]) -> str | None:
         """An option of the training, or a property of this photograph, that graphs do not support."""
         model = self.model
-        is_transparent = batch["image"].shape[-1] == 4
+        exposed = model.photograph is not None
         obstacles = (
-            ("exposures of transparent photographs are learnt", model.photograph is not None and is_transparent),
+            ("exposures of transparent photographs are learnt", exposed and batch["image"].shape[-1] == 4),
             ("the robust loss fades in", model.trimming is not None and model.trimming.fades_at(model.schedule_step)),
             ("camera poses are learnt", model.camera_optimizer.config.mode != "off"),
             ("the head's network sees pixels", model.head.at_pixel),
@@ -129,14 +129,14 @@ class StepGraphs:
         splats = list(model.gauss_params.values())
         objects = [*splats, model.head]  # the head's weights live as long as it does
         settings = {
+            "objects": [id(value) for value in objects],
             "places": [value.data_ptr() for value in splats],
             "head": model.head.phase,
             "densification": model.densification.rests_at(model.step),
             "trims": model.trimming is not None and model.trimming.is_on(model.schedule_step),
             "downscale": model._get_downscale_factor(),
         }
-        same = [id(value) for value in objects] == [id(value) for value in self._recorded]
-        if same and settings == self._settings:
+        if settings == self._settings:
             return False
         self._update_pairs()
         if settings["downscale"] != self._settings.get("downscale"):

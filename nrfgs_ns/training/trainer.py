@@ -114,8 +114,7 @@ class NrfgsTrainer(Trainer):
         self.mean = ParameterMean() if self.config.average_steps > 0 else None
         self.pace = self.config.pace()
         groups = self.pipeline.get_param_groups()
-        every = self.config.logging.steps_per_log
-        return LeanOptimizers(self.optimizer_configs(), groups, every, self.pace)
+        return LeanOptimizers(self.optimizer_configs(), groups, self.config.logging.steps_per_log, self.pace)
 
     # Resuming.
 
@@ -269,10 +268,9 @@ class NrfgsTrainer(Trainer):
         timed = isinstance(self.pace, TimedPace)
         left = self.pace.steps_left if timed else self.last_step - step  # timed: an estimate
         size = window(self.config.average_steps, step + 1 + left)
-        if timed:
-            is_stale = left >= 2 * size  # a window that has begun stays unless the estimate was far off
-        else:
-            is_stale = mean.count >= size - left  # a mean of the last steps before the training was extended
+        # A timed window stays once begun, unless the estimate was far off. Otherwise the mean may be of steps that were
+        # the last before the training was extended.
+        is_stale = left >= 2 * size if timed else mean.count >= size - left
         if is_stale or self.pipeline.model.densification.moved_at == step:
             mean.forget()
         if left < size or mean.count > 0:
@@ -361,10 +359,8 @@ class NrfgsTrainer(Trainer):
         with self._last_good_state_on_disk():
             self.guard.settle()
         if stopped or self.mean.count == 0:
-            reason = "the time was up sooner than foreseen"
-            if stopped:
-                reason = "the training was stopped before its last step"
-            warn(f"Nothing was averaged, despite average_steps: {reason}. The model is the last step's.")
+            why = "the training was stopped before its last step" if stopped else "the time was up sooner than foreseen"
+            warn(f"Nothing was averaged, despite average_steps: {why}. The model is the last step's.")
             return
         CONSOLE.print(f"The trained model is the mean of its parameters over the last {self.mean.count} steps.")
         with self.train_lock:

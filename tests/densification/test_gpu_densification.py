@@ -67,6 +67,6 @@ def test_one_camera_is_the_kernels(monkeypatch, sums):
     twin = Statistics(*(value.clone() for value in tables))
     statistics.in_torch(twin, Step(rows, radii, 640.0, (640.0, 480.0)), *shown)
     monkeypatch.setattr(statistics, "in_torch", None)
-    statistics.update_statistics(tables, info, 1.0, *shown)
+    statistics.accumulate(tables, info, 1.0, *shown)
     for value, other in zip(tables, twin, strict=True):
         torch.testing.assert_close(value, other, rtol=1e-6, atol=0.0)

@@ -28,11 +28,11 @@ from nrfgs_ns.appearance.fused.tiles import (
     load_latents,
     load_three,
     operand,
-    scatter_gradients,
-    scatter_latent_gradients,
     sigmoid,
     sin_half_turns,
     stack,
+    store_gradients,
+    store_latents,
     tanh,
     unstack,
 )  # fmt: skip
@@ -288,21 +288,21 @@ def backward_kernel(
         else:
             d_W1 = dot(tl.trans(X), d_pre, d_W1, GRADIENT_KIND)
         d_Z, d_F = tl.split(tl.reshape(d_X, (B, P, 2)))
-        scatter_latent_gradients(d_latents, rows, d_Z, valid, D, P, B, ONE_CENTER)
+        store_latents(d_latents, rows, d_Z, valid, D, P, B, ONE_CENTER)
 
         # Features.
         d_view, d_base = _features_backward(d_F, waves, lanes, B, P // 4, BANDS)
         d_stored = tl.where(lanes < 3, sh_c0 * (d_base + d_color), d_out * logit_slope + d_base * base * (1.0 - base))
         d_stored = deal(d_stored, B)
-        scatter_gradients(d_features_dc + rows * 3 + lanes, d_stored, valid & (lanes < 3), ONE_CENTER)
-        scatter_gradients(d_logits + rows + (lanes - 3), d_stored, valid & (lanes == 3), ONE_CENTER)
+        store_gradients(d_features_dc + rows * 3 + lanes, d_stored, valid & (lanes < 3), ONE_CENTER)
+        store_gradients(d_logits + rows + (lanes - 3), d_stored, valid & (lanes == 3), ONE_CENTER)
 
         # Geometry: d = v / r and log r, where r is floored and has no slope below the floor.
         radial = tl.sum(tl.where(lanes < 3, -d_view * d, d_view), axis=1)[:, None]
         radial = tl.where(above_floor, radial, 0.0)
         d_v = inv_r * (d_view + radial * d)
         mask = valid & (lanes < 3)
-        scatter_gradients(d_means + rows * 3 + lanes, deal(-d_v, B), mask, ONE_CENTER)
+        store_gradients(d_means + rows * 3 + lanes, deal(-d_v, B), mask, ONE_CENTER)
         if CENTER and ONE_CENTER:
             d_center += d_v  # 0 beyond `count`, where d_out is
         if CENTER and not ONE_CENTER:

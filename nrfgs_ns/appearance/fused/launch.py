@@ -127,17 +127,15 @@ class FusedFunction(torch.autograd.Function):
         packed = _packed(packing, weights)
         launch = launches.forward
         count = len(visible)
-        colors_out = packed.new_empty(count, 3)
-        opacities_out = packed.new_empty(count)
+        outputs = packed.new_empty(count, 3), packed.new_empty(count)
         if count > 0:
             launch_forward(
-                (_programs(launch, count, visible.device), 1, 1), *tables, visible, centers, packed,
-                colors_out, opacities_out,
+                (_programs(launch, count, visible.device), 1, 1), *tables, visible, centers, packed, *outputs,
                 count, *options.scalars, **_constants(packing, launch, options, centers.dim() == 1),
             )  # fmt: skip
         ctx.save_for_backward(*tables, visible, centers, packed)
         ctx.packing, ctx.launch, ctx.options = packing, launches.backward, options
-        return colors_out, opacities_out
+        return outputs
 
     @staticmethod
     @once_differentiable
@@ -145,10 +143,9 @@ class FusedFunction(torch.autograd.Function):
         packing, launch, options = ctx.packing, ctx.launch, ctx.options
         *tables, visible, centers, packed = ctx.saved_tensors
         count, rows, device = len(visible), len(tables[0]), visible.device
-        one_center = centers.dim() == 1
-        wants_center = ctx.needs_input_grad[8]  # of forward's `centers`
-        writes_each_row = one_center and count == rows
-        d_tables = _tables(rows, packing.latent_dim, device, zero=not writes_each_row)
+        one_center, wants_center = centers.dim() == 1, ctx.needs_input_grad[8]  # of forward's `centers`
+        # Without zeros only where the kernel writes each row, once.
+        d_tables = _tables(rows, packing.latent_dim, device, zero=not one_center or count < rows)
         d_centers = torch.empty_like(centers) if wants_center else tables[0].new_empty(CENTER_SLOTS)
         if count > 0:
             programs = _programs(launch, count, device)

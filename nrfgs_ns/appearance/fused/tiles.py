@@ -153,7 +153,7 @@ def load_latents(latents, rows, D: tl.constexpr, P: tl.constexpr, B: tl.constexp
 
 
 @triton.jit
-def scatter_gradients(pointers, values, mask, UNIQUE: tl.constexpr):
+def store_gradients(pointers, values, mask, UNIQUE: tl.constexpr):
     """Write gradients to rows of a table; with rows that may repeat (not UNIQUE), add them up."""
     if UNIQUE:
         tl.store(pointers, values, mask=mask)
@@ -162,14 +162,12 @@ def scatter_gradients(pointers, values, mask, UNIQUE: tl.constexpr):
 
 
 @triton.jit
-def scatter_latent_gradients(
-    d_latents, rows, d_Z, valid, D: tl.constexpr, P: tl.constexpr, B: tl.constexpr, UNIQUE: tl.constexpr
-):
-    """`scatter_gradients` of d_Z [B, P], laid out as by load_latents."""
+def store_latents(d_latents, rows, d_Z, valid, D: tl.constexpr, P: tl.constexpr, B: tl.constexpr, UNIQUE: tl.constexpr):
+    """`store_gradients` of d_Z [B, P], laid out as by load_latents."""
     stacked = tl.permute(tl.reshape(d_Z, (B, P // 16, 16)), (0, 2, 1))
     twos: tl.constexpr = 2 if P == 64 else 1 if P == 32 else 0
     pieces = unstack(tl.reshape(stacked, (B, 16) + (2,) * twos), P // 16)
     for i in tl.static_range(P // 16):
         columns = 16 * i + tl.arange(0, 16)[None, :]
         piece = tl.permute(tl.reshape(pieces[i], (B // 16, 2, 8, 4, 4)), (1, 0, 2, 4, 3))
-        scatter_gradients(d_latents + rows * D + columns, tl.reshape(piece, (B, 16)), valid & (columns < D), UNIQUE)
+        store_gradients(d_latents + rows * D + columns, tl.reshape(piece, (B, 16)), valid & (columns < D), UNIQUE)

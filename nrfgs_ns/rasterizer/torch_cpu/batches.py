@@ -141,8 +141,7 @@ class Batch:
 def pairs_of(lists: TileLists, tiles: Tensor, first: int, n: int) -> Tensor:
     """The n pairs of each of B tiles from the `first` in depth on, [B, n]; K, the padding, where a list is shorter."""
     depth = torch.arange(first, first + n)
-    start = lists.start.index_select(0, tiles)
-    count = lists.count.index_select(0, tiles)
+    start, count = lists.start.index_select(0, tiles), lists.count.index_select(0, tiles)
     return torch.where(depth < count[:, None], start[:, None] + depth, lists.n_pairs)
 
 
@@ -177,8 +176,7 @@ def group_by_count(remaining: Tensor, tiles: Tensor, pixels: int) -> list[tuple[
     begin = 0
     elements = batch_elements()
     while begin < len(counts):
-        tiles_that_fit = elements // ((counts[begin] + 1) * pixels)
-        end = min(len(counts), begin + max(1, tiles_that_fit))
+        end = min(len(counts), begin + max(1, elements // ((counts[begin] + 1) * pixels)))
         fewest = 0.75 * counts[begin] - 4  # bounds the padding to a quarter, or four splats
         while counts[end - 1] < fewest:
             end -= 1

@@ -59,7 +59,7 @@ class _Screen(NamedTuple):
     clamped: tuple[Tensor, Tensor]  # u, v, [n] each
     directions: Tensor  # quaternions of length 1, [4, n]
     rotations: Tensor  # R_q, [3, 3, n]
-    axes: tuple[Tensor, ...]  # rows of W R_q diag(s), [3, n] each
+    axes: list[Tensor]  # rows of W R_q diag(s), [3, n] each
     rows: tuple[Tensor, Tensor]  # a_0, a_1, [3, n] each
     normal: Tensor  # a_0 x a_1, [3, n]
 
@@ -104,7 +104,7 @@ def _to_screen(
 
     unit = directions(quats)
     rotations = rotation_matrices(unit)
-    right, down, forward = _rotate(W, rotations * scales.t())
+    right, down, forward = axes = _rotate(W, rotations * scales.t())
     a0, a1 = (fx / pz) * (right - u * forward), (fy / pz) * (down - v * forward)
 
     xx, xy, yy = (a0 * a0).sum(0), (a0 * a1).sum(0), (a1 * a1).sum(0)
@@ -112,7 +112,6 @@ def _to_screen(
     det = normal.square().sum(0)
     det_blurred = det + EPS2D * (xx + yy) + EPS2D**2
     blurred = xx + EPS2D, xy, yy + EPS2D
-    axes = right, down, forward
     return _Screen(means2d, pz, blurred, det, det_blurred, slopes, (u, v), unit, rotations, axes, (a0, a1), normal)
 
 

@@ -203,6 +203,5 @@ def list_tiles(footprints: Footprints, block: Block) -> TileLists:
     tile, slot = torch.sort(tile.to(torch.int32), stable=True)
     tiles, count = torch.unique_consecutive(tile, return_counts=True)
     splat = splat.index_select(0, entry).index_select(0, slot)
-    splat = F.pad(splat, (0, 1), value=footprints.rows.numel())
-    slot = F.pad(slot, (0, 1), value=slot.numel())
+    splat, slot = F.pad(splat, (0, 1), value=footprints.rows.numel()), F.pad(slot, (0, 1), value=slot.numel())
     return TileLists(tiles.long(), count.cumsum(0) - count, count, splat, slot, splat_start)
