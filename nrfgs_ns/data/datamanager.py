@@ -40,7 +40,7 @@ from nrfgs_ns.files import whole
 LENS = ("fx", "fy", "cx", "cy", "width", "height")
 """Fields of a camera that undistortion changes."""
 PAGE = 4096
-"""Bytes."""
+"""Bytes of a page of memory."""
 WITH_POINTS = {"nerfstudio-data": NerfstudioDataParserConfig(load_3D_points=True)}
 DataParsers = tyro.conf.OmitSubcommandPrefixes[
     tyro.extras.subcommand_type_from_defaults(all_dataparsers | WITH_POINTS, prefix_names=False)

@@ -160,8 +160,8 @@ class Densification(ABC):
         seen = (CHANGE, CHANGE_BEFORE)[:windows] if self.opacity_seen == "peak" else ()
         self.state = {GROWTH_LIMIT: None, **dict.fromkeys((FIRST_COUNT, *seen) if self.budget else seen)}
         self.shown: tuple[Tensor, Tensor, int] | None = None
-        """From `pre_backward` to `post_backward`: rows of the splats that the step's cameras see, int64 [M], one for
-        each camera; their opacities from there, [M] in [0, 1]; and the number of cameras."""
+        """From `pre_backward` to `post_backward`: rows of the splats that the step's cameras see, int64 [M], once
+        for each camera; their opacities from there, [M] in [0, 1]; and the number of cameras."""
 
     def needs_absgrad(self, step: int) -> bool:
         """Whether the rasterizer must leave sum |dL/dmean2d| in `info["means2d"].absgrad` in this step."""

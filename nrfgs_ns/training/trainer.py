@@ -50,6 +50,7 @@ class NrfgsTrainer(Trainer):
         pace: position on the schedules; None: the step.
         steps_are_chosen: whether the number of training views decides how many steps there are.
         mean: the parameters' mean over the last steps; None without `average_steps`.
+        graphs: recorded steps; None with several devices.
     """
 
     def __init__(self, config: NrfgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
