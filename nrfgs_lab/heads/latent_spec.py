@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from nrfgs_lab.heads.features import FeatureHead
-from nrfgs_ns.appearance.head import NEAREST, AppearanceHeadConfig, unit_vectors
+from nrfgs_ns.appearance.head import NEAR, AppearanceHeadConfig, unit_vectors
 from nrfgs_ns.appearance.sh import num_bases, sh_bases
 
 DIRECTION_DEGREE = 3
@@ -73,7 +73,7 @@ class LatentSpec(FeatureHead):
         if camera_centers is None:
             return torch.cat([features, torch.zeros_like(features[:, :1])], dim=-1)
         towards = splats["means"].index_select(0, visible) - camera_centers
-        seen_along = encoded(unit_vectors(towards, NEAREST * self.scene_unit))
+        seen_along = encoded(unit_vectors(towards, NEAR * self.scene_unit))
         mask = self.mask(torch.cat([features[:, self.config.diffuse_dim :], seen_along], dim=-1))
         return torch.cat([features, mask], dim=-1)
 

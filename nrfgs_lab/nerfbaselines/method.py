@@ -144,7 +144,7 @@ class Nrfgs:
         for callback in trainer.callbacks:
             callback.run_callback_at_location(step, location=TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
         if step == trainer.last_step:
-            trainer.take_the_mean()
+            trainer.install_mean()
         writer.EVENT_STORAGE.clear()  # nobody reads nerfstudio's log
         self.step = step + 1
         if step % self.config.logging.steps_per_log != 0:

@@ -95,7 +95,7 @@ def read(folder: str, out: str, options: str) -> None:
     over.set()
     data = trainer.pipeline.datamanager
     images = [*data.cached_train, *data.cached_eval]
-    record = {"size": list(images[0]["image"].shape[1::-1]), "kept_in": data._place, "seconds": seconds}
+    record = {"size": list(images[0]["image"].shape[1::-1]), "kept_in": data._storage, "seconds": seconds}
     own = data.train_dataparser_outputs.metadata.get("points3D_xyz", ())
     record |= {"views": len(data.train_dataset), "points": len(own), "splats": trainer.pipeline.model.num_points}
     record |= {"cpu_seconds": process_time() - start, "own_bytes": peak[0] - before}

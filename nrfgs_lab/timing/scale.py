@@ -228,7 +228,7 @@ class Bare:
     def image(self, camera: Cameras) -> Tensor:
         """The image [H, W, 3]; a camera is converted once, since that takes the host longer than a step."""
         if id(camera) not in self.seen:
-            pinhole = Pinholes().fixed(camera, self.device)
+            pinhole = Pinholes().of_full_size(camera, self.device)
             self.seen[id(camera)] = camera, pinhole, pinhole.K[0].tolist()
         return self.draw(*self.seen[id(camera)][1:])
 

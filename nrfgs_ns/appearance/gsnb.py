@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from nrfgs_ns.appearance.head import NEAREST, SplatAppearance, layers, unit_vectors
+from nrfgs_ns.appearance.head import NEAR, SplatAppearance, layers, unit_vectors
 from nrfgs_ns.appearance.nrf import BAND_DIM, fourier_bands
 from nrfgs_ns.appearance.sh import ShConfig, SphericalHarmonics, eval_sh, num_bases
 
@@ -64,7 +64,7 @@ class NeuralBasis(SphericalHarmonics):
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
         means, coefficients, opacities = self.rows(splats, visible, camera_centers)
-        directions = unit_vectors(means - camera_centers, NEAREST * self.scene_unit)
+        directions = unit_vectors(means - camera_centers, NEAR * self.scene_unit)
         inputs = torch.cat(fourier_bands(directions, BANDS), dim=-1)
         learnt = self.basis(inputs if self.config.raw_direction else inputs[:, 3:])  # [M, B]
         colors = eval_sh(self.active_degree, directions, coefficients)

@@ -5,7 +5,7 @@ A head defines the numbers that a splat stores (`splat_params`), which densifica
 without knowing their meaning; colours and opacities of the splats that a camera sees (`forward`); and their part that
 does not depend on the view (`base_appearance`). Shared weights are the head's own parameters.
 
-A field is a head and the table of splats that it draws; in training the head sees the field under `ViewNoise`.
+A field is a head and the table of splats that it colours; in training the head sees the splats under `ViewNoise`.
 """
 
 import math
@@ -25,7 +25,7 @@ from nrfgs_ns.errors import InputError
 
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi))."""
-NEAREST = 0.01
+NEAR = 0.01
 """Smallest camera distance, in scene units: the near plane, closer than which nothing is drawn."""
 
 
@@ -33,13 +33,13 @@ class SplatAppearance(NamedTuple):
     """Colours and opacities of M splats, from one camera position each."""
 
     colors: Tensor
-    """Linear blend colours, [M, 3], >= 0; 1 is white. Of a head at the pixel: any D numbers, [M, D]."""
+    """Linear blend colours, [M, 3], >= 0; 1 is white. For a head at the pixel: features, [M, D] with any D."""
     opacities: Tensor
     """Peak opacities, [M], in [0, 1]."""
 
 
 class Component(NamedTuple):
-    """One part of a head's result, for the viewer."""
+    """One part of a head's result at M splats, for the viewer."""
 
     values: Tensor
     """[M, 3] for a change of colour, in units of white; [M, 1] otherwise."""
@@ -87,7 +87,7 @@ class AppearanceHead(nn.Module, ABC):
     name: str
     """Short name, written into checkpoints."""
     config: AppearanceHeadConfig
-    """The configuration that has set it up."""
+    """The configuration from which `setup` built the head."""
     sh_degree: int = 0
     """Degree of the spherical harmonics among the splats' parameters; 0 if there are none."""
     scene_unit: float = 1.0
@@ -126,10 +126,10 @@ class AppearanceHead(nn.Module, ABC):
         )
 
     def image_of(self, composited: Tensor, rays: Tensor) -> Tensor:
-        """The opaque image [H, W, 3] of a head at the pixel; 1 is white. Composited colours are one already.
+        """The opaque image [H, W, 3] of a head at the pixel; 1 is white. Other heads' composited colours are the image.
 
         Args:
-            composited: its features composited over zero, [H, W, D].
+            composited: the splats' features, composited over zero, [H, W, D].
             rays: unit directions from the camera through the pixels, in world axes, [H, W, 3].
         """
         return composited
@@ -146,8 +146,8 @@ class AppearanceHead(nn.Module, ABC):
         """Parts of the head's result, for the viewer and for logs; never called in training.
 
         Each is a mode of the viewer under its name. The names must not depend on the arguments; M = 0 must work.
-        "residual", the colours of `forward` less those of `base_appearance`, is always there, but for a head at the
-        pixel, which has none.
+        "residual" is always there: the colours of `forward` minus those of `base_appearance`. A head at the pixel has
+        no components.
         """
         if self.at_pixel:
             return {}
@@ -159,19 +159,19 @@ class AppearanceHead(nn.Module, ABC):
 
     @property
     def phase(self) -> Hashable:
-        """The state that `set_step` sets: in steps of one phase the head computes the same."""
+        """What `set_step` has set: while it stays equal, the head computes the same function."""
         return None
 
     def try_kernels(self, device: torch.device) -> None:  # noqa: B027  (most heads have none)
         """Try the head's own kernels on a CUDA device, which compiles them before the first step."""
 
     def neutral_loss(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> Tensor | None:
-        """Mean squared residual, a scalar to minimise in the warm-up; None without shared weights to train."""
+        """Mean squared residual, a scalar that the warm-up minimises; None for a head that needs no warm-up."""
         return None
 
 
-class Sight(Protocol):
-    """Which splats are seen, and from where."""
+class VisibleSplats(Protocol):
+    """The M splats that a view shows, and the camera centres that they are seen from."""
 
     @property
     def visible(self) -> Tensor:
@@ -183,22 +183,22 @@ class Sight(Protocol):
 
 
 class Field(NamedTuple):
-    """A head and the table of the splats that it draws."""
+    """A head and the table of the N splats that it colours."""
 
     head: AppearanceHead
     splats: Mapping[str, Tensor]
     """"means", "opacities" and the head's `splat_params`, [N, ...]"""
 
-    def seen_from(self, view: Sight) -> SplatAppearance:
+    def seen_from(self, view: VisibleSplats) -> SplatAppearance:
         """Colours and opacities of the M splats that a view sees."""
         return self.head(self.splats, view.visible, view.center)
 
-    def base_of(self, view: Sight) -> SplatAppearance:
-        """Their part that does not depend on the camera."""
+    def base_of(self, view: VisibleSplats) -> SplatAppearance:
+        """The part of `seen_from` that does not depend on the camera."""
         return self.head.base_appearance(self.splats, view.visible)
 
     def detached(self) -> "Field":
-        """The same without gradients to the table."""
+        """The same field without gradients to the table."""
         return Field(self.head, {name: value.detach() for name, value in self.splats.items()})
 
     @property
@@ -256,8 +256,8 @@ class ViewNoise:
 
 
 @contextmanager
-def failures_told(config: AppearanceHeadConfig) -> Iterator[None]:
-    """Turn an exception of a head's code, which may be anybody's, into an InputError with its place."""
+def located_errors(config: AppearanceHeadConfig) -> Iterator[None]:
+    """Re-raise an exception of a head's code, which may be anybody's, as an InputError that names file and line."""
     try:
         yield
     except InputError:
@@ -273,34 +273,34 @@ def failures_told(config: AppearanceHeadConfig) -> Iterator[None]:
 
 @torch.no_grad()
 def check_head(head: AppearanceHead, splats: Mapping[str, Tensor]) -> None:
-    """Raise InputError where a head breaks its contract. It is asked about one of its initial splats, in two rows
-    beyond the table's end: a table of the head's own would miss the splats that densification adds."""
-    whose = f"{type(head).__module__}.{type(head).__name__}"
+    """Raise InputError where a head breaks its contract, given its initial table. `forward` sees two more rows, copies
+    of a splat: a head with a table of its own, which densification could not extend, fails here."""
+    where = f"{type(head).__module__}.{type(head).__name__}"
     count = len(splats["means"])
 
-    def require(what: str, value: Tensor, *shape: int) -> None:
+    def require(part: str, value: Tensor, *shape: int) -> None:
         if value.dtype != torch.float32 or value.shape != shape or not value.isfinite().all():
-            found = f"{str(value.dtype).removeprefix('torch.')} {[*value.shape]}"
-            found += "" if value.isfinite().all() else ", not all finite"
-            raise InputError(f"{whose}: {what} must be finite float32 {[*shape]}, but is {found}. Correct it there.")
+            actual = f"{str(value.dtype).removeprefix('torch.')} {[*value.shape]}"
+            actual += "" if value.isfinite().all() else ", not all finite"
+            raise InputError(f"{where}: {part} must be finite float32 {[*shape]}, but is {actual}. Correct it there.")
 
     if not isinstance(getattr(head, "name", None), str):
-        raise InputError(f'{whose} has no name, which checkpoints need. Give the class one, such as name = "mine".')
+        raise InputError(f'{where} has no name, which checkpoints need. Give the class one, such as name = "mine".')
     for name, value in splats.items():
         require(f"{name!r} of splat_params", value, count, *value.shape[1:])
     if count == 0:
         return
     table = {name: value[:1].expand(count + 2, *value.shape[1:]).contiguous() for name, value in splats.items()}
-    answer = head(table, torch.arange(count, count + 2), splats["means"][0] + head.scene_unit)
-    if not isinstance(answer, SplatAppearance):
-        kind = type(answer).__name__
-        raise InputError(f"{whose}: forward returns a {kind}. Let it return SplatAppearance(colors, opacities).")
-    require("opacities of forward, for two splats,", answer.opacities, 2)
-    require("colors of forward, for two splats,", answer.colors, 2, answer.colors.shape[-1] if head.at_pixel else 3)
+    result = head(table, torch.arange(count, count + 2), splats["means"][0] + head.scene_unit)
+    if not isinstance(result, SplatAppearance):
+        kind = type(result).__name__
+        raise InputError(f"{where}: forward returns a {kind}. Let it return SplatAppearance(colors, opacities).")
+    require("opacities of forward, for two splats,", result.opacities, 2)
+    require("colors of forward, for two splats,", result.colors, 2, result.colors.shape[-1] if head.at_pixel else 3)
     if head.at_pixel:
-        picture = answer.colors[0].repeat(16, 16, 1)
+        features = result.colors[0].repeat(16, 16, 1)
         rays = torch.tensor([0.0, 0.0, 1.0]).repeat(16, 16, 1)
-        require("what image_of makes of 16 x 16 pixels", head.image_of(picture, rays), 16, 16, 3)
+        require("what image_of makes of 16 x 16 pixels", head.image_of(features, rays), 16, 16, 3)
 
 
 def layers(*widths: int) -> list[nn.Module]:
@@ -310,7 +310,7 @@ def layers(*widths: int) -> list[nn.Module]:
 
 
 def base_opacities(logits: Tensor) -> Tensor:
-    """Base opacities [M] from stored logits [M, 1]. Picking rows after the sigmoid may change the last bit."""
+    """Base opacities [M] from stored logits [M, 1]. Select rows first: after the sigmoid the last bit may differ."""
     return torch.sigmoid(logits).squeeze(-1)
 
 

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The neural residual field: one tiny network, shared by the scene, that adds a bounded residual to every splat.
 
-Splat i stores a base colour c, a base opacity alpha and a latent z. Seen from direction d at distance r, with the
-direction's Fourier bands split into low(d) and high(d):
+Splat i stores a mean x, a base colour c, a base opacity alpha and a latent z. For a camera centre o let
+
+    v = o - x,    r = max(|v|, eps),    d = v / r,
+
+low(d) be d and its Fourier band 0, and high(d) bands 1 to K - 1; band k is sin(2^k pi d) and cos(2^k pi d). Then
 
     (dc_low, d_alpha) = low branch (z, c, alpha, log r, low(d))
     (dc_high, w)      = high branch(z, c,        log r, high(d))
@@ -14,37 +17,30 @@ The gate w lets detail through only where it pays. Both branches are one hidden 
 48 -> 64 -> 4, 6,664 weights at the default sizes. Without the split, one branch of twice the width sees everything
 (58 -> 128 -> 4, 8,068 weights), without a gate.
 
-Two bounds keep opacity in [0, 1], with t = tanh(d_alpha) and x = alpha + s_alpha t:
+Two bounds keep opacity in [0, 1], with t = tanh(d_alpha) and a = alpha + s_alpha t:
 
-    straight-through   min(max(x, 0), 1), with the gradient of x, so that a splat beyond an end can come back
+    straight-through   min(max(a, 0), 1), with the gradient of a, so that a splat beyond an end can come back
     logit              sigmoid(logit + 4 s_alpha t); at half opacity, to first order, alpha + s_alpha t
 
 On the logit the residual scales with the opacity: n copies of a splat, each of about alpha / n, together look like one.
-`fused/` computes the same in two GPU kernels.
+`fused/` computes the same function in two GPU kernels.
 """
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args, get_type_hints
 
 import torch
 from torch import Tensor, nn
 
 from nrfgs_ns.appearance.fused import FusedField
-from nrfgs_ns.appearance.head import (
-    NEAREST,
-    AppearanceHead,
-    AppearanceHeadConfig,
-    Component,
-    SplatAppearance,
-    base_colors,
-)
+from nrfgs_ns.appearance.head import NEAR, AppearanceHead, AppearanceHeadConfig, Component, SplatAppearance, base_colors
 
 OpacityBound = Literal["straight-through", "logit"]
-OPACITY_BOUNDS: tuple[OpacityBound, ...] = ("straight-through", "logit")
+OPACITY_BOUNDS: tuple[OpacityBound, ...] = get_args(OpacityBound)
 LOGIT_SLOPE = 4.0
-"""One over the sigmoid's slope at half opacity."""
+"""Slope of the logit at half opacity, dlogit/dalpha = 1 / (alpha (1 - alpha))."""
 LATENT_STD = 0.1
 """Standard deviation of the initial latents."""
 FARTHEST = 1e18
@@ -74,7 +70,7 @@ class NrfConfig(AppearanceHeadConfig):
     """largest change of a colour channel (s_c), in units of white"""
     opacity_scale: float = 0.2
     """largest change of opacity (s_alpha); twice this with error-guided and mcmc, unless `opacity_bound` is given"""
-    distance_eps: float = NEAREST
+    distance_eps: float = NEAR
     """smallest camera distance, in scene units; shorter ones count as this. The near plane"""
     output_init: Literal["zero", "default"] = "zero"
     """start of the output layers. zero: no residual. default: torch's, as in the paper, followed by the warm-up"""
@@ -107,21 +103,18 @@ class NrfConfig(AppearanceHeadConfig):
         for name in ("color_scale", "opacity_scale"):
             self.require(getattr(self, name) >= 0, name, "zero or positive")
         self.require(self.distance_eps > 0, "distance_eps", "positive")
-        for name, choices in (
-            ("output_init", ("zero", "default")),
-            ("opacity_bound", (None, *OPACITY_BOUNDS)),
-            ("implementation", ("auto", "torch", "fused")),
-            ("precision", ("fp32", "tf32", "bf16", "fp16")),
-        ):
+        hints = get_type_hints(NrfConfig)
+        literals = {name: get_args(hints[name]) for name in ("output_init", "implementation", "precision")}
+        for name, choices in {**literals, "opacity_bound": (None, *OPACITY_BOUNDS)}.items():
             self.require(getattr(self, name) in choices, name, "one of " + ", ".join(map(repr, choices)))
 
 
 class Branches(NamedTuple):
-    """Base appearance, and the branches' outputs before any tanh; None for what the configuration leaves out."""
+    """Base appearance of M splats, and the branches' outputs before any tanh; None where the configuration has none."""
 
     color: Tensor  # c, not clamped, [M, 3]
-    logit: Tensor  # of alpha, [M, 1]
-    dc_low: Tensor  # [M, 3]; of the single branch, if there is only one
+    logit: Tensor  # logit of alpha, [M, 1]
+    dc_low: Tensor  # [M, 3]; from the single branch, if there is only one
     dc_high: Tensor | None  # [M, 3]
     gate: Tensor | None  # sigmoid(w), [M, 1]
     d_alpha: Tensor | None  # [M, 1]
@@ -153,10 +146,10 @@ class NeuralResidualField(AppearanceHead):
         self.fused = FusedField(config, branches)
 
     def try_kernels(self, device: torch.device) -> None:
-        self.fused.try_on(device)
+        self.fused.try_kernels(device)
 
     def splat_params(self, rgb: Tensor) -> dict[str, Tensor]:
-        """Base colours and latents: "features_dc" [N, 3], "latents" [N, D] ~ N(0, 0.1^2)."""
+        """Base colours and latents: "features_dc" [N, 3], "latents" [N, D] ~ N(0, LATENT_STD^2)."""
         latents = torch.randn(len(rgb), self.config.latent_dim, device=rgb.device) * LATENT_STD
         return {**super().splat_params(rgb), "latents": latents}
 
@@ -168,9 +161,10 @@ class NeuralResidualField(AppearanceHead):
         return SplatAppearance((out.color + self._color_residual(out)).clamp_min(0.0), opacities)
 
     def components(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> dict[str, Component]:
-        """The residuals, before colours are clamped at black; branches and gate, if there are two branches.
+        """The residuals of colour, before the clamp at black, and opacity; with two branches also both and the gate.
 
-        "low branch" is the residual with a shut gate, s_c tanh(dc_low), and "high branch" the rest of "residual".
+        "low branch" is the colour residual with a shut gate, s_c tanh(dc_low); "high branch" is the difference between
+        "residual" and it.
         """
         out = self._branches(splats, visible, camera_centers)
         residual = self._color_residual(out)
@@ -190,7 +184,8 @@ class NeuralResidualField(AppearanceHead):
         loss = self._color_residual(out).square().mean()
         if out.d_alpha is None:
             return loss
-        return loss + (self.config.opacity_scale * torch.tanh(out.d_alpha)).square().mean()
+        opacity_residual = self.config.opacity_scale * torch.tanh(out.d_alpha)
+        return loss + opacity_residual.square().mean()
 
     def _branches(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> Branches:
         means, latents, features_dc, logit = (
@@ -201,30 +196,33 @@ class NeuralResidualField(AppearanceHead):
         low, high = fourier_bands(directions, self.config.num_bands)
 
         shared = [latents, color] + ([log_distance] if self.config.use_distance else [])
-        inputs = [*shared, torch.sigmoid(logit), low]
-        out = self.low(torch.cat(inputs if self.config.split_bands else [*inputs, high], dim=-1))
+        bands = [low] if self.config.split_bands else [low, high]  # a single branch sees all
+        low_outputs = self.low(torch.cat([*shared, torch.sigmoid(logit), *bands], dim=-1))
+        dc_low = low_outputs[:, :3]
+        d_alpha = low_outputs[:, 3:] if self.config.opacity_residual else None
         dc_high = gate = None
         if self.high is not None:
-            detail = self.high(torch.cat([*shared, high], dim=-1))
-            dc_high = detail[:, :3]
-            gate = torch.sigmoid(detail[:, 3:])
-        return Branches(color, logit, out[:, :3], dc_high, gate, out[:, 3:] if self.config.opacity_residual else None)
+            high_outputs = self.high(torch.cat([*shared, high], dim=-1))
+            dc_high = high_outputs[:, :3]
+            gate = torch.sigmoid(high_outputs[:, 3:])
+        return Branches(color, logit, dc_low, dc_high, gate, d_alpha)
 
     def _color_residual(self, out: Branches) -> Tensor:
-        """s_c tanh(dc_low + sigmoid(w) dc_high), [M, 3]."""
+        """Colour residual s_c tanh(dc_low + sigmoid(w) dc_high), [M, 3]."""
         dc = out.dc_low if out.dc_high is None else out.dc_low + out.gate * out.dc_high
         return self.config.color_scale * torch.tanh(dc)
 
     def _opacity(self, out: Branches) -> Tensor:
-        """Opacity with its residual, [M, 1]."""
+        """Opacity as the view shows it, [M, 1]."""
         if out.d_alpha is None:
             return torch.sigmoid(out.logit)
         return bounded_opacity(out.logit, torch.tanh(out.d_alpha), self.config.opacity_scale, self.config.bound)
 
 
 def view_geometry(means: Tensor, camera_centers: Tensor, eps: float, unit: float = 1.0) -> tuple[Tensor, Tensor]:
-    """Unit directions from splats to their cameras, and log distances: v / r and log r for v = camera - mean,
-    r = max(|v|, eps). With the camera on the splat its gradient is at most 1 / eps.
+    """Directions d = v / r from splats to their cameras, and log r, for v = o - x and r = max(|v|, eps).
+
+    The gradient of d is at most 1 / eps, also with the camera on the splat.
 
     Args:
         means: [M, 3], world units.
@@ -233,7 +231,7 @@ def view_geometry(means: Tensor, camera_centers: Tensor, eps: float, unit: float
         unit: world units in a scene unit.
 
     Returns:
-        directions [M, 3], shorter than 1 where |v| < eps; logs of the distances in scene units, [M, 1], >= log eps.
+        d [M, 3], shorter than 1 where |v| < eps; log r with r in scene units, [M, 1], >= log eps.
     """
     v = (camera_centers - means).clamp(-FARTHEST, FARTHEST)
     r = v.square().sum(dim=-1, keepdim=True).clamp_min((eps * unit) ** 2).sqrt()
@@ -244,7 +242,7 @@ def fourier_bands(directions: Tensor, num_bands: int) -> tuple[Tensor, Tensor]:
     """Fourier bands of directions [M, 3], K >= 1: band k holds sin(2^k pi d) and cos(2^k pi d).
 
     Returns:
-        low [M, 9], raw d and band 0; high [M, 6 (K - 1)], the others.
+        low [M, 9], raw d and band 0; high [M, 6 (K - 1)], bands 1 to K - 1.
     """
     frequencies = math.pi * 2.0 ** torch.arange(num_bands, device=directions.device, dtype=directions.dtype)
     angles = directions[:, None, :] * frequencies[:, None]  # [M, K, 3]
@@ -267,5 +265,5 @@ def bounded_opacity(logit: Tensor, residual: Tensor, scale: float, bound: Opacit
     """
     if bound == "logit":
         return torch.sigmoid(logit + LOGIT_SLOPE * scale * residual)
-    x = torch.sigmoid(logit) + scale * residual
-    return x + (x.clamp(0.0, 1.0) - x).detach()
+    unbounded = torch.sigmoid(logit) + scale * residual
+    return unbounded + (unbounded.clamp(0.0, 1.0) - unbounded).detach()

@@ -1,9 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A trained neural residual field with shorter latents; nothing here trains.
+"""A trained neural residual field with shorter latents, without further training.
 
-Latents that lie in a subspace are folded into the first layer, which is exact: with z = m + B y,
+Latents z [D] that lie in a subspace are folded into the first layer (W, b), which is exact: with z = m + B y,
 
     W z + b = (W B) y + (W m + b).
+
+The subspace is found by principal components in the metric G = W^T W, with the weights of both branches' first layers
+below each other in W. A difference of latents then counts by how far it moves the hidden units, |W (z - z')|^2. With
+eigenvectors R of the weighted covariance of G^(1/2) (z - m), strongest first,
+
+    y = R^T G^(1/2) (z - m),    B = G^(-1/2) R.
 """
 
 from collections.abc import Mapping
@@ -18,26 +24,24 @@ from nrfgs_ns.appearance.nrf import NeuralResidualField, NrfConfig
 
 
 class LatentBasis(NamedTuple):
-    """Principal components: z = mean + axes y, y = inverse (z - mean). float64."""
+    """Principal components of D numbers: z = mean + axes y, y = inverse (z - mean). float64."""
 
     mean: Tensor
-    """[D]"""
+    """m, the weighted mean of the latents. [D]"""
     axes: Tensor
     """B, one component in each column, the strongest first. [D, D]"""
     inverse: Tensor
-    """[D, D]"""
+    """of B. [D, D]"""
     variances: Tensor
-    """of y, weighted, descending. [D]"""
+    """weighted variances of the components of y, descending. [D]"""
 
 
 def latent_basis(field: Field, weight: Tensor) -> LatentBasis:
-    """Principal components of the latents, in the metric of the first layer's outputs.
-
-    A direction of the latents counts by how far it moves the hidden units, |W (z - z')|^2 over both branches: the first
-    r components predict W z with the least squared error, weighted, for each r.
+    """Principal components of the latents: for each r the first r of them predict W z with the least squared error.
 
     Args:
-        weight: of each splat, >= 0; equal if their sum is 0. [N]
+        field: N splats with an NRF head.
+        weight: weight of each splat in the mean and the error, >= 0; equal if their sum is 0. [N]
     """
     latents = field.splats["latents"].detach().double()
     if not float(weight.sum()) > 0:
@@ -48,30 +52,31 @@ def latent_basis(field: Field, weight: Tensor) -> LatentBasis:
     weights = field.head.state_dict()
     first_layers = torch.cat([weights[f"{branch}.0.weight"][:, :size].double() for branch in branches(weights)])
     values, vectors = torch.linalg.eigh(first_layers.T @ first_layers)
-    # Latents beside the layer's row space keep a millionth of the strongest one's metric: everything can be inverted.
+    # G can be singular. Directions that W ignores get a millionth of the largest root, so that G^(1/2) has an inverse.
     roots = values.clamp_min(max(float(values[-1]) * 1e-12, 1e-300)).sqrt()
-    stretch, shrink = (vectors * roots) @ vectors.T, (vectors / roots) @ vectors.T
-    centred = (latents - mean) @ stretch
-    variances, turns = torch.linalg.eigh(centred.T @ (weight * centred))
-    turns = turns.flip(1)
-    return LatentBasis(mean, shrink @ turns, turns.T @ stretch, variances.flip(0).clamp_min(0.0))
+    metric_root = (vectors * roots) @ vectors.T  # G^(1/2)
+    inverse_root = (vectors / roots) @ vectors.T  # G^(-1/2)
+    centred = (latents - mean) @ metric_root
+    variances, rotation = torch.linalg.eigh(centred.T @ (weight * centred))
+    rotation = rotation.flip(1)  # R: eigh's order is ascending
+    return LatentBasis(mean, inverse_root @ rotation, rotation.T @ metric_root, variances.flip(0).clamp_min(0.0))
 
 
 def with_rank(field: Field, basis: LatentBasis, rank: int) -> Field:
-    """Latents of `rank` numbers, 1..D: their first principal components, folded into the first layer."""
+    """The field with latents of `rank` numbers, 1..D: the first principal components, folded into the first layer."""
     reduced = (field.splats["latents"].detach().double() - basis.mean) @ basis.inverse[:rank].T
     return _folded(field, reduced, basis.axes[:, :rank], basis.mean)
 
 
 def with_components(field: Field, columns: Tensor) -> Field:
-    """Only these components of the latents, [R], at least one; the others are 0 for every splat."""
+    """The field with these columns of the latents alone, [R], R >= 1; the others count as 0 for every splat."""
     latents = field.splats["latents"].detach().double()
     axes = torch.eye(latents.shape[1]).to(latents)[:, columns]
     return _folded(field, latents[:, columns], axes, axes.new_zeros(len(axes)))
 
 
 def _folded(field: Field, reduced: Tensor, axes: Tensor, mean: Tensor) -> Field:
-    """The same field of the latents y [N, R] with z = mean + axes y, all float64."""
+    """The same field with latents y = reduced [N, R], where z = mean + axes y, for axes [D, R]; all float64."""
     weights = dict(field.head.state_dict())
     for branch in branches(weights):
         of_latents, others = weights[f"{branch}.0.weight"].double().tensor_split([len(axes)], dim=1)

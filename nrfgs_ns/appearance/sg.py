@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from nrfgs_ns.appearance.head import (
-    NEAREST,
+    NEAR,
     AppearanceHead,
     AppearanceHeadConfig,
     SplatAppearance,
@@ -87,7 +87,7 @@ class SphericalGaussians(AppearanceHead):
     def _lobes(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> Tensor:
         """Sum of the visible splats' lobes, [M, 3]."""
         means = splats["means"].index_select(0, visible)
-        directions = unit_vectors(means - camera_centers, NEAREST * self.scene_unit)
+        directions = unit_vectors(means - camera_centers, NEAR * self.scene_unit)
         axes = unit_vectors(splats["sg_axes"].index_select(0, visible), SHORTEST_AXIS)
         sharpness = splats["sg_sharpness"].index_select(0, visible).abs()
         heights = torch.exp(sharpness * ((axes * directions[:, None]).sum(dim=-1) - 1.0))  # [M, L]

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from nrfgs_ns.appearance.hash_grid import HashGrid, kernels_run_on
-from nrfgs_ns.appearance.head import NEAREST, Component, SplatAppearance, layers, unit_vectors
+from nrfgs_ns.appearance.head import NEAR, Component, SplatAppearance, layers, unit_vectors
 from nrfgs_ns.appearance.sh import ShConfig, SphericalHarmonics, eval_sh
 
 HIDDEN_WIDTH = 32
@@ -58,7 +58,7 @@ class ViewDirectionFactors(SphericalHarmonics):
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
         means, coefficients, opacities = self.rows(splats, visible, camera_centers)
-        directions = unit_vectors(means - camera_centers, NEAREST * self.scene_unit)
+        directions = unit_vectors(means - camera_centers, NEAR * self.scene_unit)
         factors = torch.sigmoid(self.network(torch.cat([directions, self.grid(means / self.scene_unit)], dim=-1)))
         colors = eval_sh(self.active_degree, directions, coefficients) + 0.5
         return SplatAppearance(colors.clamp_min(0.0), opacities * factors[:, 0])

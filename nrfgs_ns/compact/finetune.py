@@ -15,7 +15,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor, nn
 
-from nrfgs_ns.appearance.head import Field, Sight, SplatAppearance, ViewNoise
+from nrfgs_ns.appearance.head import Field, SplatAppearance, ViewNoise, VisibleSplats
 from nrfgs_ns.appearance.reduce import build, latent_basis, with_components, with_rank
 from nrfgs_ns.compact.encode import drawable
 from nrfgs_ns.compact.rate import Density, Rounded, bits_of_places
@@ -99,7 +99,7 @@ class Gated(NamedTuple):
     field: Field
     gates: Tensor
 
-    def seen_from(self, view: Sight) -> SplatAppearance:
+    def seen_from(self, view: VisibleSplats) -> SplatAppearance:
         appearance = self.field.seen_from(view)
         return appearance._replace(opacities=appearance.opacities * self.gates[view.visible])
 

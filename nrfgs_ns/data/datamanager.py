@@ -40,7 +40,7 @@ from nrfgs_ns.files import whole
 LENS = ("fx", "fy", "cx", "cy", "width", "height")
 """Fields of a camera that undistortion changes."""
 PAGE = 4096
-"""Bytes."""
+"""Bytes of a page of memory."""
 WITH_POINTS = {"nerfstudio-data": NerfstudioDataParserConfig(load_3D_points=True)}
 DataParsers = tyro.conf.OmitSubcommandPrefixes[
     tyro.extras.subcommand_type_from_defaults(all_dataparsers | WITH_POINTS, prefix_names=False)
@@ -139,11 +139,11 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
     def load_all_images(self) -> None:
         """Decode all images. InputError if an image or a mask cannot be used, or nothing is visible in any training
         image."""
-        for split, images in ((self.train_dataset, self.cached_train), (self.eval_dataset, self.cached_eval)):
-            named = zip(split.image_filenames, images, strict=True)
-            if empty := [path.name for path, data in named if not _shows_anything(data)]:
+        for dataset, images in ((self.train_dataset, self.cached_train), (self.eval_dataset, self.cached_eval)):
+            pairs = zip(dataset.image_filenames, images, strict=True)
+            if empty := [path.name for path, data in pairs if not _shows_anything(data)]:
                 finding = f"{self.get_datapath()}: masks or transparency leave nothing of {some(empty)}"
-                if split is self.train_dataset and len(empty) == len(images):
+                if dataset is self.train_dataset and len(empty) == len(images):
                     raise InputError(f"{finding}. Masks are 0 outside and 255 inside; opaque pixels have alpha 255.")
                 warn(f"{finding}.")
 
@@ -157,7 +157,8 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         return self._view(index), self._image(index)
 
     def next_train_views(self, count: int, own: int) -> tuple[list[Cameras], dict[str, Any]]:
-        """The next `count` cameras in turn, and the image of number `own`."""
+        """The next `count` training cameras in turn, [1] each, and the photograph of the one at position `own` of
+        them."""
         indices = [self._next_index() for _ in range(count)]
         return [self._view(index) for index in indices], self._image(indices[own])
 
@@ -165,8 +166,8 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         index = self.train_unseen_cameras.pop(0)
         if len(self.train_unseen_cameras) == 0:
             self.train_unseen_cameras = self.sample_train_cameras()
-        if self._place == "files":
-            self._reader.submit(look_through, self.cached_train[self.train_unseen_cameras[0]]["image"])
+        if self._storage == "files":
+            self._reader.submit(read_pages, self.cached_train[self.train_unseen_cameras[0]]["image"])
         return index
 
     def _image(self, index: int) -> dict[str, Any]:
@@ -182,7 +183,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         return self._views[index]
 
     @cached_property
-    def _place(self) -> Literal["device", "memory", "files"]:
+    def _storage(self) -> Literal["device", "memory", "files"]:
         """Where decoded images are kept: on the device if they take at most half of its free memory, else on the host,
         else in files."""
         each = 1 if self.config.cache_images_type == "uint8" else 4
@@ -204,32 +205,30 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
     def _load_images(
         self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]
     ) -> list[dict[str, Tensor]]:
-        """All images of a split, decoded and undistorted; `_place` decides where, not `cache_images_device`."""
+        """All images of a split, decoded and undistorted; `_storage` decides where, not `cache_images_device`."""
         dataset = self.train_dataset if split == "train" else self.eval_dataset
-        place = self._place
+        storage = self._storage
         kind = self.config.cache_images_type
-        read = from_files if place == "files" else undistorted
+        read = from_cache if storage == "files" else undistorted
 
-        def placed(data: dict[str, Any]) -> dict[str, Any]:
-            if torch.device(self.device).type == "cpu" or place == "files":
+        def stored(data: dict[str, Any]) -> dict[str, Any]:
+            if torch.device(self.device).type == "cpu" or storage == "files":
                 return data
-            move = Tensor.pin_memory if place == "memory" else lambda values: values.to(self.device)
+            move = Tensor.pin_memory if storage == "memory" else lambda values: values.to(self.device)
             return data | {name: move(data[name]) for name in ("image", "mask") if name in data}
 
         sizes = [(dataset.downscale * width, dataset.downscale * height) for width, height in dataset._sizes]
         workers = self.config.max_thread_workers
         pictures = in_parallel(lambda index: read(dataset, index, kind), sizes, f"Reading {split} images", workers)
-        images = [placed(data) for data in pictures]
+        images = [stored(data) for data in pictures]
         # Undistorted images are a pinhole's, whatever the lens.
         dataset.cameras.camera_type = torch.full_like(dataset.cameras.camera_type, CameraType.PERSPECTIVE.value)
-        self.train_cameras = self.train_dataset.cameras.to(self.device if place == "device" else "cpu")
+        self.train_cameras = self.train_dataset.cameras.to(self.device if storage == "device" else "cpu")
         return images
 
     def sampling_state(self) -> dict[str, Any]:
         """State of the order of training cameras, of plain numbers, lists and tuples."""
-        generator = self.random_generator.getstate()
-        unseen = list(self.train_unseen_cameras)
-        return {"unseen_cameras": unseen, "generator": generator}
+        return {"unseen_cameras": list(self.train_unseen_cameras), "generator": self.random_generator.getstate()}
 
     def load_sampling_state(self, state: dict[str, Any]) -> None:
         """Continue the order of cameras from `sampling_state()` of the same images (`training/identity.py`)."""
@@ -267,41 +266,41 @@ def undistorted(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
     return data
 
 
-def from_files(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
-    """The same from a mapped file, which writing to the tensors does not change, and which is made if it is missing;
-    InputError if there is no room for it."""
-    path = _file(dataset, index, image_type)
+def from_cache(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
+    """`undistorted` from a file that is mapped into memory, and made first if it is missing. Writing to the tensors
+    does not change the file. InputError if there is no room for it."""
+    path = _cache_file(dataset, index, image_type)
     try:
-        kept = torch.load(path, mmap=True, weights_only=True)
+        content = torch.load(path, mmap=True, weights_only=True)
     except Exception:  # missing, or cut, as cleaners of caches leave them
-        made = undistorted(dataset, index, image_type)
-        kept = {name: made[name].contiguous() for name in ("image", "mask") if name in made}
-        kept["lens"] = [getattr(dataset.cameras, name)[index].item() for name in LENS]
+        data = undistorted(dataset, index, image_type)
+        content = {name: data[name].contiguous() for name in ("image", "mask") if name in data}
+        content["lens"] = [getattr(dataset.cameras, name)[index].item() for name in LENS]
         try:
-            with whole(path) as aside:
-                torch.save(kept, aside)
+            with whole(path) as unfinished:
+                torch.save(content, unfinished)
         except (OSError, RuntimeError) as error:  # torch raises RuntimeError where the disk is full
             fix = "Make room, set XDG_CACHE_HOME to another folder, or give more --pipeline.datamanager.image-memory."
             raise InputError(f"{path} cannot be written ({error}). {fix}") from error
-        kept = torch.load(path, mmap=True, weights_only=True)
-    _set_lens(dataset.cameras, index, kept.pop("lens"))
-    return {"image_idx": index, **kept}
+        content = torch.load(path, mmap=True, weights_only=True)
+    _set_lens(dataset.cameras, index, content.pop("lens"))
+    return {"image_idx": index, **content}
 
 
-def look_through(image: Tensor) -> None:
+def read_pages(image: Tensor) -> None:
     """Read one byte of each page of a mapped image, so that it is in memory."""
     image.view(torch.uint8).flatten()[::PAGE].sum()
 
 
-def _file(dataset: Any, index: int, image_type: str) -> Path:
-    """A photograph's file, named by a digest of all that decides its pixels."""
+def _cache_file(dataset: Any, index: int, image_type: str) -> Path:
+    """A photograph's file in the cache, named by a digest of all that its pixels depend on."""
     outputs, cameras = dataset._dataparser_outputs, dataset.cameras
     paths = [names[index] for names in (outputs.image_filenames, outputs.mask_filenames) if names is not None]
     files = [(str(path.resolve()), (stat := path.stat()).st_size, stat.st_mtime_ns) for path in paths]
     distortion = None if cameras.distortion_params is None else cameras.distortion_params[index].tolist()
     camera = [distortion, *(getattr(cameras, name)[index].item() for name in (*LENS, "camera_type"))]
-    kept = [files, camera, image_type, dataset.scale_factor, str(outputs.alpha_color)]
-    name = hashlib.sha256(json.dumps(kept).encode("utf-8", "surrogateescape")).hexdigest()[:24]
+    inputs = [files, camera, image_type, dataset.scale_factor, str(outputs.alpha_color)]
+    name = hashlib.sha256(json.dumps(inputs).encode("utf-8", "surrogateescape")).hexdigest()[:24]
     return cache_folder() / f"{name}.pt"
 
 

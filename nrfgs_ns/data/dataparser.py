@@ -142,14 +142,14 @@ class NrfgsDataParser(DataParser):
         return DataSet(meta, source, splits, factor, lenses, cameras, transform, to_frames, scale)
 
     def _factor(self, frames: list[dict[str, Any]], source: Path) -> int:
-        """The downscale factor; every file is there at it."""
+        """The downscale factor, given or by the images' size; InputError if a file is missing at that size."""
         factor = self.config.downscale_factor
         if factor is None:
             checks.check_exist([self._file(frame["file_path"]) for frame in frames], source, "images")
             factor = self._auto_factor(frames[0]["file_path"], max(read_size(self._file(frames[0]["file_path"]))))
         for key in FOLDERS:
-            what = "images" if key == "file_path" else f"files of {key}"
-            checks.check_exist(self._files(frames, key, factor), source, what)
+            kind = "images" if key == "file_path" else f"files of {key}"
+            checks.check_exist(self._files(frames, key, factor), source, kind)
         return factor
 
     def _auto_factor(self, first: str, size: int) -> int:
@@ -173,8 +173,8 @@ class NrfgsDataParser(DataParser):
         paths = [self._file(frame["file_path"]) for frame in meta["frames"]]
         named = self._named_splits(meta)
         if named and "train" not in named:
-            there = next(iter(named.values()))[0]  # test_filenames, test_list.txt
-            raise InputError(f"{source} has {there}, but no train_{there.partition('_')[2]}. Name the training images.")
+            given, _ = next(iter(named.values()))  # such as test_filenames or test_list.txt
+            raise InputError(f"{source} has {given}, but no train_{given.partition('_')[2]}. Name the training images.")
         splits = (
             split_by_names(named, paths, self._file, source) if named else split_by_rule(self.config, paths, source)
         )
@@ -199,15 +199,15 @@ class NrfgsDataParser(DataParser):
 
     def _check_sizes(self, data_set: DataSet, rows: np.ndarray, key: str, paths: list[Path], cameras: Cameras) -> None:
         """Check that images or masks have the size of their cameras, or the full one without smaller copies."""
-        what = FOLDERS[key]
+        kind = FOLDERS[key]
         if self._has_copies(key, data_set.factor):
             checks.check_unique(paths, f"{data_set.source}: frames")
             folder = self._copies(key, data_set.factor)
             fix = f"Remove {folder}, or with `colmap` give --downscale-rounding-mode round or ceil."
-            checks.check_headers(paths, torch.cat([cameras.width, cameras.height], dim=1).tolist(), what, fix)
+            checks.check_headers(paths, torch.cat([cameras.width, cameras.height], dim=1).tolist(), kind, fix)
         else:
             fix = "Use the images of the poses, or scale w, h, fl_x, fl_y, cx and cy with them; masks are as large."
-            checks.check_headers(paths, data_set.lenses[rows, 4:6].astype(int), what, fix)
+            checks.check_headers(paths, data_set.lenses[rows, 4:6].astype(int), kind, fix)
 
     @cached_property
     def _placed_points(self) -> dict[str, torch.Tensor]:

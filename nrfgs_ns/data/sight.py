@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the training views see the initial points: of different reconstructions, axes or units, poses, intrinsics and
-points each look sane."""
+"""Whether the training views see the initial points. Poses, intrinsics and points of different reconstructions, axes or
+units each look sane by themselves."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,7 +23,8 @@ FEWEST_SEEN = 0.01
 MOST_BLIND = 0.5
 """Share of the views that may see no point."""
 LEAST_SPREAD = 0.01
-"""Median distance of points from their middle, over the cameras' from there; of real captures it is 0.1 and more."""
+"""Smallest median distance of points from their middle, relative to the cameras' from there; in real captures it is at
+least 0.1."""
 ONE_WORLD = "Poses, intrinsics and points must be of one reconstruction, in one world and unit."
 
 
@@ -32,7 +33,7 @@ def in_reach(xyz: np.ndarray, cameras: Cameras, source: Path) -> np.ndarray:
     positions = cameras.camera_to_worlds[:, :3, 3].double().numpy()
     middle = positions.mean(axis=0)
     distance = np.abs(xyz - middle).max(axis=1, initial=0)
-    reach = np.abs(positions - middle).max() or np.median(distance)  # of cameras at one place, the points' own
+    reach = np.abs(positions - middle).max() or np.median(distance)  # the points' own if all cameras are at one place
     near = distance <= FARTHEST * reach
     if not near.all():
         finding = f"{np.count_nonzero(~near)} of {len(xyz)} points are {FARTHEST:,.0f} times as far away"
@@ -50,8 +51,9 @@ def check_sight(xyz: torch.Tensor, cameras: Cameras, names: Sequence[str], sourc
     if not share >= FEWEST_SEEN:  # nor without points
         raise InputError(f"{source}: {100 * share:.2g} % of the {len(xyz)} points are in a training view. {ONE_WORLD}")
     middle = points.median(dim=0).values
-    spread, away = ((places - middle).norm(dim=1).median() for places in (points, cameras.camera_to_worlds[:, :3, 3]))
-    if spread <= LEAST_SPREAD * away:
+    spread = (points - middle).norm(dim=1).median()
+    cameras_away = (cameras.camera_to_worlds[:, :3, 3] - middle).norm(dim=1).median()
+    if spread <= LEAST_SPREAD * cameras_away:
         fix = "Make the points anew, or start from random ones with --load-3D-points False."
         finding = f"the {len(xyz)} points to start from are all at one place, or half of them are"
         raise InputError(f"{source}: {finding}. {fix}")
@@ -63,7 +65,7 @@ def check_sight(xyz: torch.Tensor, cameras: Cameras, names: Sequence[str], sourc
 
 
 def _in_view(points: torch.Tensor, camera: Cameras) -> torch.Tensor:
-    """Points [N, 3] in front of a camera, in its image or a margin about it, bool [N]."""
+    """Whether points [N, 3] are in front of a camera, in its image or within `MARGIN` of it, bool [N]."""
     rotation, position = camera.camera_to_worlds[:3, :3], camera.camera_to_worlds[:3, 3]
     x, y, z = ((points - position) @ rotation).unbind(-1)
     depth = -z

@@ -47,12 +47,13 @@ def scene_unit(positions: Tensor) -> float:
 
 
 SAME_PLACE = 0.01
-"""Largest distance of cameras at one place, as a share of the capture's reach, and angle of one direction, radians."""
+"""Largest difference of cameras at one place, relative to the largest distance of a camera from the mean of all; and of
+one direction, in radians."""
 
 
 def different_views(poses: Tensor) -> int:
-    """Number of views among camera-to-world poses [V, 3 or 4, 4] without those at the place and in the direction of an
-    earlier one (copies, frames of a camera that stands still)."""
+    """Number of different views among camera-to-world poses [V, 3 or 4, 4]: without those at the place and in the
+    direction of an earlier one, such as copies, or frames of a camera that stands still."""
     directions = poses[:, :3, 2].double().cpu().numpy()
     return len(_first_of_each(np.concatenate([_in_reaches(poses[:, :3, 3]), directions], axis=1)))
 
@@ -67,8 +68,8 @@ def nearest_depth(points: Tensor, cameras: Cameras) -> float:
     """Depth at which the nearest training camera sees the nearest points, in world units; 0 if no camera sees enough.
 
     Args:
-        points: of the capture, [P, 3].
-        cameras: pinhole cameras of the training, [V].
+        points: the capture's points, [P, 3], world units.
+        cameras: the training's pinhole cameras, [V].
     """
     points = points[:: max(len(points) // 10_000, 1)].float()
     nearest = math.inf
@@ -110,14 +111,14 @@ def camera_spacing(centers: Tensor) -> float:
 
 
 def _in_reaches(centers: Tensor) -> np.ndarray:
-    """Camera centres [V, 3] about their mean, in distances from there to the farthest."""
-    away = centers.double().cpu().numpy()
-    away = away - away.mean(axis=0)
-    return away / np.linalg.norm(away, axis=1).max(initial=1e-300)
+    """Camera centres [V, 3] relative to their mean, in units of the largest distance from it."""
+    centers = centers.double().cpu().numpy()
+    offsets = centers - centers.mean(axis=0)
+    return offsets / np.linalg.norm(offsets, axis=1).max(initial=1e-300)
 
 
 def _first_of_each(rows: np.ndarray) -> list[int]:
-    """Indices of rows [V, K] that are not near an earlier one. Near linear: few of the rows kept find the same row."""
+    """Indices of rows [V, K] not within `SAME_PLACE` of an earlier one, in almost linear time."""
     from scipy.spatial import cKDTree
 
     kept = []

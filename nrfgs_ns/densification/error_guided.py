@@ -29,7 +29,7 @@ from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 from torch.nn import Parameter
 
-from nrfgs_ns.densification.statistics import Tables, remember
+from nrfgs_ns.densification.statistics import Statistics, accumulate
 from nrfgs_ns.densification.strategy import CHANGE, Densification, DensificationConfig, OpacitySeen, Optimizers, Splats
 
 ERROR = "error"
@@ -90,10 +90,10 @@ class ErrorGuidedDensification(Densification):
 
     gradients = "absolute"
 
-    def __init__(self, config: ErrorGuided, raised: float):
+    def __init__(self, config: ErrorGuided, threshold: float):
         super().__init__(config, windows=2)
         self.state |= {ERROR: None, WIDTH: None}
-        self.raised = raised
+        self.threshold = threshold
         self.reschedule(round)
 
     def reschedule(self, step_at: Callable[[float], int]) -> None:
@@ -111,18 +111,19 @@ class ErrorGuidedDensification(Densification):
         self.shown = None
         if step >= self.stop:
             return
-        self._take_statistics(step, info, len(splats["means"]))
+        self._update_statistics(step, info, len(splats["means"]))
         if step > self.start and step % self.config.refine_every == 0:
             self._refine(step, info, splats, optimizers)
             self.begin_another_window()
             self.state[ERROR].zero_()
             self.state[WIDTH].zero_()
 
-    def _take_statistics(self, step: int, info: Mapping[str, Any], count: int) -> None:
-        """Let the window's maxima be at least the step's."""
+    def _update_statistics(self, step: int, info: Mapping[str, Any], count: int) -> None:
+        """Let the window's maxima be at least the step's; errors only while splats grow."""
         self.make_tables((ERROR, WIDTH, CHANGE), count, info["radii"].device)
-        error, gradients = (self.state[ERROR], info["means2d"].absgrad) if step < self.grow_until else (None, None)
-        remember(Tables(self.state[WIDTH], error, self.state.get(CHANGE)), info, 1.0, gradients, info.get("change"))
+        grows = step < self.grow_until
+        tables = Statistics(self.state[WIDTH], self.state[ERROR] if grows else None, self.state.get(CHANGE))
+        accumulate(tables, info, 1.0, info["means2d"].absgrad if grows else None, info.get("change"))
 
     # What a refinement does.
 
@@ -133,33 +134,42 @@ class ErrorGuidedDensification(Densification):
         width = self.state[WIDTH]
         opacities = self.seen_opacity(splats["opacities"])
         dead = opacities < DEAD
-        parents = draw((opacities * (width > 0)).masked_fill(dead, 0.0), int(dead.sum()))
+        alive_and_seen = (opacities * (width > 0)).masked_fill(dead, 0.0)
+        parents = draw(alive_and_seen, int(dead.sum()))
         places = dead.nonzero()[:, 0][: len(parents)]
         grown = parents[:0]
         if step < self.grow_until:
             weights, wanted = self._candidates(step, count, dead, width > WIDEST, len(places))
-            wanted = self.fitting(step, info, splats, optimizers, max(min(wanted, self.config.most_splats - count), 0))
+            wanted = max(min(wanted, self.config.most_splats - count), 0)
+            wanted = self.room_for(step, info, splats, optimizers, wanted)
             grown = draw(weights.index_fill(0, parents, 0.0), wanted)
         split(splats, optimizers, torch.cat([parents, grown]), places)
-        source = torch.cat([torch.arange(count, device=dead.device).index_copy(0, places, parents), grown])
-        self.take_rows(source, count)
-        stored = torch.sigmoid(splats["opacities"].detach()) - DECAY * (1 - min(step / max(self.end, 1), 1.0))
-        splats["opacities"].data.copy_(torch.logit(stored.clamp(1e-6, 1 - torch.finfo(stored.dtype).eps)))
+        made_from = torch.cat([torch.arange(count, device=dead.device).index_copy(0, places, parents), grown])
+        self.take_rows(made_from, count)
+        self._decay_opacities(step, splats["opacities"])
         if self.verbose:
             print(f"Step {step}: {len(places)} GSs replaced, {len(grown)} split. Now having {count + len(grown)} GSs.")
 
-    def _candidates(self, step: int, count: int, dead: Tensor, wide: Tensor, replaced: int) -> tuple[Tensor, int]:
-        """Weights [N] by which splats are drawn to be split, and how many are wanted.
+    def _decay_opacities(self, step: int, logits: Parameter) -> None:
+        """Take from each stored opacity `DECAY` at first, falling linearly to 0 at the training's end. [N, 1]"""
+        opacities = torch.sigmoid(logits.detach()) - DECAY * (1 - min(step / max(self.end, 1), 1.0))
+        logits.data.copy_(torch.logit(opacities.clamp(1e-6, 1 - torch.finfo(opacities.dtype).eps)))
 
-        Without a budget: `SHARE` of the splats above the threshold, less those that replace dead ones, and all wide
-        ones. With one, as many as the number lacks of its `course`.
+    def _candidates(self, step: int, count: int, dead: Tensor, wide: Tensor, replaced: int) -> tuple[Tensor, int]:
+        """Weights [N] by which splats are drawn to be split, wide ones first, and how many are wanted.
+
+        Without a budget: `SHARE` of the splats above the threshold, minus the `replaced` ones, but at least all wide
+        ones. With a budget: as many as are missing from `planned_count`.
+
+        Args:
+            dead, wide: bool [N].
         """
         error = self.state[ERROR].masked_fill(dead, 0.0)
         wide = wide & ~dead
         if self.budget:
-            wanted = round(self.course(step, count, self.start, self.grow_until)) - count
+            wanted = round(self.planned_count(step, count, self.start, self.grow_until)) - count
             return error.masked_fill(wide, math.inf), wanted
-        weights = error * (error > self.raised)
+        weights = error * (error > self.threshold)
         wanted = max(round(SHARE * int((weights > 0).sum())) - replaced, int(wide.sum()))
         return weights.masked_fill(wide, math.inf), wanted
 

@@ -11,7 +11,7 @@ from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import remove, reset_opa
 from torch import Tensor
 
-from nrfgs_ns.densification.statistics import Tables, remember
+from nrfgs_ns.densification.statistics import Statistics, accumulate
 from nrfgs_ns.densification.strategy import Densification, DensificationConfig
 
 EXTENT_MARGIN = 1.1
@@ -21,7 +21,7 @@ THRESHOLD = "log_threshold"
 RECOVERY = 3
 """Refinements after a reset of opacities at which a training with a budget prunes nothing."""
 DEAD_BAND = 0.01
-"""Share by which the number of splats may differ from a budget's course before the threshold moves."""
+"""Share by which the number of splats may differ from `planned_count` before the threshold moves."""
 LARGEST_STEP = 0.12
 """Largest change of the threshold's logarithm at a refinement."""
 STRATEGY_BOUNDS = ("refine_start_iter", "refine_stop_iter", "refine_scale2d_stop_iter")
@@ -44,7 +44,7 @@ class GradientConfig(DensificationConfig):
         self.require(self.reset_alpha_every >= 1, "reset_alpha_every", "at least 1")
 
     def _build(self, scene_unit: float | None, **thresholds: Any) -> "GradientDensification":
-        """Gsplat's strategy with these thresholds."""
+        """A strategy by gsplat's rules with these thresholds, under the names of its `DefaultStrategy`."""
         rules = PruneBySeenOpacity(
             refine_start_iter=self.warmup_length,
             refine_stop_iter=self.stop_split_at,
@@ -108,7 +108,7 @@ class Original(GradientConfig):
 
 
 class PruneBySeenOpacity(DefaultStrategy):
-    """gsplat's strategy with another idea of which opacity counts when splats are pruned."""
+    """gsplat's strategy, except that `seen_opacity` decides which splats are pruned."""
 
     seen_opacity: Callable[[Tensor], Tensor]
     """logits [N, 1] -> opacities [N]"""
@@ -162,7 +162,7 @@ class GradientDensification(Densification):
         strategy = self.strategy
         self.take_changes(info, len(splats["means"]))
         if step < strategy.refine_stop_iter:
-            self._take_statistics(info, len(splats["means"]))
+            self._update_statistics(info, len(splats["means"]))
             if step == 0 and self.measure_by_cameras:
                 return
             if self._refines(step):
@@ -172,13 +172,13 @@ class GradientDensification(Densification):
         if step % strategy.reset_every == 0 or self._refines(step):
             self.begin_another_window()
 
-    def _take_statistics(self, info: Mapping[str, Any], count: int) -> None:
+    def _update_statistics(self, info: Mapping[str, Any], count: int) -> None:
         """Add a step's screen-space gradients, in an image of [-1, 1], and radii, in shares of the longer side."""
         state = self.state
         means2d = info["means2d"]
         gradients = means2d.absgrad if self.strategy.absgrad else means2d.grad
         self.make_tables(("grad2d", "count", "radii"), count, gradients.device)
-        remember(Tables(state.get("radii"), state["grad2d"], state["count"]), info, 2.0, gradients, sums=True)
+        accumulate(Statistics(state.get("radii"), state["grad2d"], state["count"]), info, 2.0, gradients, sums=True)
 
     def _refine(self, step: int, info: Mapping[str, Any], splats, optimizers) -> None:
         """Grow and prune by gsplat's rules, and begin the statistics anew."""
@@ -191,7 +191,7 @@ class GradientDensification(Densification):
         if step < strategy.refine_scale2d_stop_iter:
             growing |= state["radii"] > self.widest
         wanted = int(growing.sum())
-        if (room := self.fitting(step, info, splats, optimizers, wanted)) < wanted:
+        if (room := self.room_for(step, info, splats, optimizers, wanted)) < wanted:
             largest = gradients.kthvalue(count - room).values.item()  # the threshold is exclusive
             strategy.grow_grad2d, strategy.grow_scale2d = max(threshold, largest), math.inf
         duplicated, split = strategy._grow_gs(splats, optimizers, state, step)
@@ -208,14 +208,14 @@ class GradientDensification(Densification):
         torch.cuda.empty_cache()
 
     def _threshold_for_budget(self, step: int, gradients: Tensor) -> float:
-        """The gradient above which splats grow now, for as many as the budget by the end of growth.
+        """The gradient above which splats grow at this refinement, so that growth ends with the budget's number.
 
-        Where the number is off its `course`, the logarithm of the threshold moves, by at most `LARGEST_STEP`. No more
-        splats grow by their gradient than bring the number to its course; wide ones may be split besides.
+        Where the number is off its `planned_count`, the threshold's logarithm moves, by at most `LARGEST_STEP`. Growth
+        by gradients [N] stops at the planned number; wide splats may be split besides.
         """
         state = self.state
         count = len(gradients)
-        goal = self.course(step, count, self.strategy.refine_start_iter, self.strategy.refine_stop_iter)
+        goal = self.planned_count(step, count, self.strategy.refine_start_iter, self.strategy.refine_stop_iter)
         if abs(count - goal) > DEAD_BAND * goal:
             state[THRESHOLD] += max(-LARGEST_STEP, min(math.log(count / goal), LARGEST_STEP))
         threshold = self.threshold * math.exp(state[THRESHOLD])

@@ -49,10 +49,9 @@ class Mcmc(DensificationConfig):
 class McmcDensification(Densification):
     """Relocation, growth to a budget, and noise (`relocation.py`).
 
-    Which opacity is seen decides that a splat is dead, and how far noise may move it. What a relocated splat gets is
-    computed from the stored opacities. The mean opacity in the loss is the one that the step's cameras are shown
-    (`mean_opacity`). With the stored ones alone, splats that every view shows would count as dead, too, and the noise
-    would shake them.
+    The seen opacity (`seen_opacity`) decides whether a splat is dead, and how far noise may move it: by the stored one,
+    splats that every view shows could count as dead, and the noise would shake them. What a relocated splat gets is
+    computed from stored opacities. The loss takes the mean of the opacities that the step shows (`mean_opacity`).
     """
 
     def __init__(self, config: Mcmc, scene_unit: float):
@@ -77,15 +76,18 @@ class McmcDensification(Densification):
         add_noise(splats, size, self.seen_opacity(splats["opacities"]))
 
     def _relocate_and_add(self, step: int, info: Mapping[str, Any], splats: Splats, optimizers: Optimizers) -> None:
-        """Move the dead and grow by 5 %. A new row has been changed by views as the splat that it was made from: its
-        stored opacity is another, but the head would answer for it much as for that one."""
+        """Move the dead and grow by 5 %, up to the budget.
+
+        A moved or new row takes over the change of opacity of the splat that it was made from. Their stored opacities
+        differ, but the head changes both alike.
+        """
         dead = self.seen_opacity(splats["opacities"], before=False) <= MIN_OPACITY
         count = len(splats["means"])
-        moved = relocate(splats, optimizers, dead, MIN_OPACITY)
+        moved_from = relocate(splats, optimizers, dead, MIN_OPACITY)
         wanted = max(min(self.budget, int(1.05 * count)) - count, 0)
-        wanted = self.fitting(step, info, splats, optimizers, wanted)
-        added = add_samples(splats, optimizers, wanted, MIN_OPACITY)
-        self.take_rows(moved[added], count)
+        wanted = self.room_for(step, info, splats, optimizers, wanted)
+        made_from = add_samples(splats, optimizers, wanted, MIN_OPACITY)
+        self.take_rows(moved_from[made_from], count)
 
     def reschedule(self, step_at: Callable[[float], int]) -> None:
         self.start, self.stop = step_at(self.config.warmup_length), step_at(self.config.stop_at)

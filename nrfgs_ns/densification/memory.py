@@ -9,11 +9,11 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 SHARE = 0.9
-"""Share of the memory that growth may fill: it is not in one piece, and views differ."""
+"""Share of the memory that growth may fill: free memory is in pieces, and views differ in what they need."""
 PLENTY = 0.25
 """Share of the memory up to which torch may keep what it does not use."""
 BYTES_PER_PIXEL = 200
-"""What a step holds of a pixel: the image, the photograph and SSIM's means of both, with their gradients."""
+"""Bytes that a step needs for a pixel: the image, the photograph and SSIM's means of both, with their gradients."""
 
 
 def allowed(device: torch.device) -> int:
@@ -28,9 +28,15 @@ def allowed(device: torch.device) -> int:
 def most_splats(splats: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer], later_pixels: int) -> int:
     """The most splats that a refinement may grow to; no limit on a CPU, and where there are none yet.
 
-    Each will take what each takes now, in parameters, gradients, moments and a step's other tensors and lists. Besides,
-    while rows are added, parameters and moments are there twice. The training's largest image has `later_pixels` more
-    than the present ones.
+    A splat is taken to need what each of the N present ones needs now, for parameters, gradients, moments and a step's
+    other tensors and lists; while rows are added, parameters and moments also exist a second time (`copied`). So
+
+        most = N (SHARE * available - fixed - BYTES_PER_PIXEL * later_pixels) / (reserved - fixed + copied),
+
+    with `reserved` the bytes that torch has, and `fixed` those that do not grow with the splats.
+
+    Args:
+        later_pixels: pixels that the training's largest image has more than the present ones.
     """
     device = splats["means"].device
     count = len(splats["means"])
@@ -39,20 +45,20 @@ def most_splats(splats: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer
     moments = [value for name in splats for value in optimizers[name].state.get(splats[name], {}).values()]
     parameters = sum(value.nbytes for value in splats.values())
     copied = parameters + sum(value.nbytes for value in moments if value.dim() > 0)
-    # Counted as what does not grow: photographs, for the most part; also what several graphs leave.
+    # Photographs, for the most part; also what several graphs leave. Gradients take as much as parameters.
     fixed = max(torch.cuda.memory_allocated(device) - copied - parameters, 0)
     room = SHARE * available(device) - fixed - BYTES_PER_PIXEL * later_pixels
     return max(int(count * room / (torch.cuda.memory_reserved(device) - fixed + copied)), 0)
 
 
 def available(device: torch.device) -> int:
-    """Bytes of a GPU that this process has or may get, beside what other processes have."""
+    """Bytes of a GPU that torch has in this process, or may still get beside other processes."""
     free, _ = torch.cuda.mem_get_info(device)
     return min(torch.cuda.memory_reserved(device) + free, allowed(device))
 
 
 def share_used(device: torch.device) -> float:
-    """Share that torch has of a GPU's available memory; 0 on a CPU."""
+    """Share of a GPU's available memory that torch has; 0 on a CPU."""
     return torch.cuda.memory_reserved(device) / available(device) if device.type == "cuda" else 0.0
 
 

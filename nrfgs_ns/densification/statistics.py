@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What growth remembers of each step: how much splats wanted to move on the screen, how large they were, and how much
-the view changed their opacity. Growth by gradients adds it up, growth by error keeps the largest.
+"""Statistics of splats between two refinements: their screen-space gradients and radii, and how much views changed
+their opacity. Growth by gradients sums norms up and counts steps; growth by error keeps the largest norms and changes.
 
-On CUDA a Triton kernel does it (`statistics_triton.py`), elsewhere and for several cameras PyTorch does.
+On CUDA a Triton kernel updates them (`statistics_triton.py`); elsewhere, and for several cameras, PyTorch does.
 """
 
 import math
@@ -15,66 +15,66 @@ from torch import Tensor
 from nrfgs_ns.kernels.trial import tried_once
 
 
-class Tables(NamedTuple):
-    """What is remembered of each of N splats, [N] each; None: not wanted."""
+class Statistics(NamedTuple):
+    """Tables of N splats, [N] each; None: not wanted."""
 
     widths: Tensor | None
     """largest radii, in shares of the image's longer side"""
     norms: Tensor | None
-    """norms of screen-space gradients, their sum or the largest"""
-    others: Tensor | None
-    """number of steps, or the largest change of opacity"""
+    """norms of screen-space gradients: their sum, or the largest"""
+    counts_or_changes: Tensor | None
+    """number of steps that have shown the splat (with sums of norms), or its largest change of opacity"""
 
 
 class Step(NamedTuple):
-    """What a step shows of M splats."""
+    """The M splats of a step."""
 
     rows: Tensor
-    """of the tables, int64 [M]"""
+    """rows of the tables, int64 [M]"""
     radii: Tensor
-    """pixels, [M]; 0 where a row is not to count"""
+    """radii in pixels, [M]; rows of radius 0 do not count"""
     side: float
-    """the image's longer one, which radii are divided by"""
+    """the image's longer side in pixels, by which radii are divided"""
     scales: tuple[float, float]
-    """what gradients by the rows' centres, in pixels, are multiplied by"""
+    """factors in x and y of the gradients, which come by a centre's position in pixels"""
 
 
-def remember(
-    tables: Tables,
+def accumulate(
+    tables: Statistics,
     info: Mapping[str, Any],
     extent: float,
     gradients: Tensor | None,
     change: Tensor | None = None,
     sums: bool = False,
 ) -> None:
-    """Take a step into the tables, which are written to. Norms that are not finite count as 0, changes that are NaN not
-    at all.
+    """Update the tables, in place, by a step. Norms that are not finite count as 0; changes that are NaN do not count.
 
     Args:
-        info: the rasterizer's; M rows, those of radius 0 of splats that are not visible.
-        extent: width and height of the image in which gradients are measured.
-        gradients: of the loss by the rows' centres, in pixels, [M, 2].
-        change: of the rows' opacities, [M].
-        sums: add up norms and steps, instead of keeping the largest norms and changes.
+        tables: tables of N splats.
+        info: the rasterizer's, of M rows; those of radius 0 belong to invisible splats.
+        extent: width and height of the image in the units by which gradients are to be taken.
+        gradients: the loss's gradients by the rows' centres in pixels, [M, 2].
+        change: changes of the rows' opacities (`strategy.change_of`), [M].
+        sums: add up norms and count steps, instead of keeping the largest norms and changes.
     """
     width, height, cameras = info["width"], info["height"], info["n_cameras"]
     scales = width / extent * cameras, height / extent * cameras
     step = Step(info["gaussian_ids"], info["radii"], float(max(width, height)), scales)
     tensors = [value for value in (*tables, gradients, change) if value is not None]
-    take = in_torch
+    update = in_torch
     if (
         tensors[0].is_cuda
         and cameras == 1  # no row occurs twice
         and all(tensor.dtype == torch.float32 and tensor.is_contiguous() for tensor in tensors)
         and try_kernel(tensors[0].device)
     ):
-        from nrfgs_ns.densification.statistics_triton import take
-    take(tables, step, gradients, change, sums)
+        from nrfgs_ns.densification.statistics_triton import in_triton as update
+    update(tables, step, gradients, change, sums)
 
 
-def in_torch(tables: Tables, step: Step, gradients: Tensor | None, change: Tensor | None, sums: bool) -> None:
-    """The kernel's twin: the same in PyTorch."""
-    (widths, norms, others), (rows, radii, side, scales) = tables, step
+def in_torch(tables: Statistics, step: Step, gradients: Tensor | None, change: Tensor | None, sums: bool) -> None:
+    """`accumulate` in PyTorch, the kernel's twin."""
+    (widths, norms, counts_or_changes), (rows, radii, side, scales) = tables, step
     seen = radii > 0
     if widths is not None:
         widths.scatter_reduce_(0, rows, radii / side, "amax")
@@ -82,19 +82,19 @@ def in_torch(tables: Tables, step: Step, gradients: Tensor | None, change: Tenso
         x, y = gradients.unbind(dim=-1)
         norm = torch.hypot(x * scales[0], y * scales[1]).nan_to_num(0.0, 0.0) * seen
         norms.scatter_reduce_(0, rows, norm, "sum" if sums else "amax")
-    if others is not None and sums:
-        others.index_add_(0, rows, seen.to(others.dtype))
-    elif others is not None:
-        others.scatter_reduce_(0, rows, change.where(seen & ~change.isnan(), -math.inf), "amax")
+    if counts_or_changes is not None and sums:
+        counts_or_changes.index_add_(0, rows, seen.to(counts_or_changes.dtype))
+    elif counts_or_changes is not None:
+        counts_or_changes.scatter_reduce_(0, rows, change.where(seen & ~change.isnan(), -math.inf), "amax")
 
 
 @tried_once("What densification remembers")
 def try_kernel(device: torch.device) -> None:
     """Whether the kernel runs on a CUDA device; the first step would compile it."""
-    from nrfgs_ns.densification.statistics_triton import take
+    from nrfgs_ns.densification.statistics_triton import in_triton
 
-    one, two = torch.ones(1, device=device), torch.ones(1, 2, device=device)
+    one, gradient = torch.ones(1, device=device), torch.ones(1, 2, device=device)
     step = Step(torch.zeros(1, dtype=torch.int64, device=device), one.int(), 1.0, (1.0, 1.0))
-    take(Tables(one, one.clone(), one.clone()), step, two, None, True)
+    in_triton(Statistics(one, one.clone(), one.clone()), step, gradient, None, True)
     for norms in (one.clone(), None):  # while splats grow, and after it
-        take(Tables(one, norms, one.clone()), step, two, one, False)
+        in_triton(Statistics(one, norms, one.clone()), step, gradient, one, False)

@@ -32,14 +32,14 @@ CHANGE = "opacity_change"
 """Name, in a strategy's `state`, of the largest change of each splat's opacity by a view, [N]: see `change_of`."""
 CHANGE_BEFORE = CHANGE + "_before"
 """The same in the window before, for strategies that look at two (`begin_another_window`)."""
-HELD = "held_at"
-"""Name, in a strategy's `state`, of a pair: the number of splats at which memory has held growth, and the bytes of
-memory that there were; None: it was never short."""
-NEAR = 1.1
-"""Estimates of the most splats that are farther above their number than this do not end growth: they are low, because
-what does not grow, images above all, counts as growing with the splats."""
-FIRST = "first_count"
-"""Name, in a strategy's `state`, of the number of splats at the first refinement, where a budget's course starts."""
+GROWTH_LIMIT = "held_at"
+"""Name, in a strategy's `state`, of a pair: the number of splats at which growth ended because memory was short, and
+the bytes that the process was allowed then; None: memory was never short."""
+NEAR_LIMIT = 1.1
+"""An estimate of the most splats ends growth only once their number times this reaches it: before, it is too low,
+because it takes memory that does not grow, such as images, for memory of splats."""
+FIRST_COUNT = "first_count"
+"""Name, in a strategy's `state`, of the number of splats at the first refinement, where a budget's growth starts."""
 UNSEEN = -2.0
 """Change of a splat that no view has shown: less than any change."""
 
@@ -61,13 +61,13 @@ def change_of(stored: Tensor, shown: Tensor) -> Tensor:
     return torch.where(added < 0, added / stored, added)
 
 
-def seen_with(stored: Tensor, change: Tensor) -> Tensor:
-    """The opacities that views with these changes show, in [0, 1]; the stored ones where the change is `UNSEEN`."""
+def shown_opacity(stored: Tensor, change: Tensor) -> Tensor:
+    """The inverse of `change_of`: opacities in [0, 1]; the stored ones where the change is `UNSEEN`."""
     change = torch.where(change > UNSEEN, change, 0.0)
     return torch.where(change < 0, stored * (1 + change), stored + change).clamp_max(1.0)
 
 
-def per_splat(state: Mapping[str, Any], count: int) -> dict[str, Tensor]:
+def per_splat_state(state: Mapping[str, Any], count: int) -> dict[str, Tensor]:
     """The entries of a state that have a row for each of `count` splats."""
     return {
         name: value
@@ -147,39 +147,37 @@ class Densification(ABC):
     verbose: bool = True
     """Whether refinements are printed."""
     pixels: int = 0
-    """Of the largest photograph."""
+    """Number of pixels of the largest photograph."""
     gradients: Literal["none", "signed", "absolute"] = "none"
-    """By the splats' places on the screen, needed until it rests; absolute: summed over pixels as such (AbsGS)."""
+    """Screen-space gradients that it needs until it rests; absolute: sums over pixels of absolute values (AbsGS)."""
+    moved_at: int | None = None
+    """Last step at which rows of the table came to denote other splats although no tensor was replaced."""
 
     def __init__(self, config: DensificationConfig, windows: int = 1):
         self.config, self.name, self.opacity_seen = config, config.name, config.opacity_seen
         self.budget: int = config.budget
         """Number of splats to grow to; 0: as many as the rules give."""
         seen = (CHANGE, CHANGE_BEFORE)[:windows] if self.opacity_seen == "peak" else ()
-        self.state = {HELD: None, **dict.fromkeys((FIRST, *seen) if self.budget else seen)}
+        self.state = {GROWTH_LIMIT: None, **dict.fromkeys((FIRST_COUNT, *seen) if self.budget else seen)}
         self.shown: tuple[Tensor, Tensor, int] | None = None
-        """What the views of a step have shown: rows of splats, int64 [M], as often as cameras see them; their opacities
-        from there, [M] in [0, 1]; and the number of cameras."""
+        """From `pre_backward` to `post_backward`: rows of the splats that the step's cameras see, int64 [M], once
+        for each camera; their opacities from there, [M] in [0, 1]; and the number of cameras."""
 
     def needs_absgrad(self, step: int) -> bool:
         """Whether the rasterizer must leave sum |dL/dmean2d| in `info["means2d"].absgrad` in this step."""
         return self.gradients == "absolute" and not self.rests_at(step)
-
-    moved_at: int | None = None
-    """Last step at which rows of the table came to denote other splats although no tensor was replaced."""
 
     def rests_at(self, step: int) -> bool:
         """Whether it needs no gradients of this step; splats may still be replaced."""
         return False
 
     def begin(self, centers: Tensor, num_splats: int, pixels: int) -> None:
-        """Take what is known before the first step; warn where there are more splats than the budget of a strategy that
-        removes none.
+        """Learn what is known before the first step; warn if there are already more splats than the budget.
 
         Args:
-            centers: of the training cameras, [V, 3].
+            centers: centres of the training cameras, [V, 3], world units.
             num_splats: splats that the training begins with.
-            pixels: of the largest photograph.
+            pixels: number of pixels of the largest photograph.
         """
         self.pixels = pixels
         if self.verbose and 0 < self.budget < num_splats:
@@ -187,15 +185,16 @@ class Densification(ABC):
             warn(f"The budget of {self.name} is {self.budget}, but the training begins with {num_splats} points. {fix}")
 
     def pre_backward(self, step: int, info: dict[str, Any], opacities: Tensor, logits: Tensor) -> None:
-        """Look at a training view before the loss goes backward. A recorded step (`training/step_graph.py`) does so
-        once for all its steps, with a row for each splat, of radius 0 where it is not visible, and fills what is left
-        in `info` anew each time.
+        """Look at a training view before the loss goes backward.
+
+        For recorded steps (`training/step_graph.py`) it runs once, in the recording: every splat has a row, of radius 0
+        where it is invisible, and each step refills the tensors in `info`.
 
         Args:
             step: training step.
-            info: the rasterizer's; M rows.
-            opacities: what the head said, [M] in [0, 1], before antialiasing compensation.
-            logits: the stored opacities of all splats, as logits [N, 1].
+            info: the rasterizer's; M rows. `change`, [M], is added if opacity is seen by its peak.
+            opacities: the head's, [M] in [0, 1], before antialiasing compensation.
+            logits: stored opacities of all splats, as logits [N, 1].
         """
         self.shown = (info["gaussian_ids"], opacities, info.get("n_cameras", 1))
         if self.gradients != "none" and not self.rests_at(step):
@@ -217,8 +216,8 @@ class Densification(ABC):
                 self.state[name] = torch.full((count,), UNSEEN if name == CHANGE else 0.0, device=device)
 
     def take_rows(self, rows: Tensor, count: int) -> None:
-        """Let these rows of the `count` present ones, in this order, be the statistics' rows."""
-        self.state.update({name: value[rows] for name, value in per_splat(self.state, count).items()})
+        """Let the statistics, which have `count` rows, become their rows `rows`, int64 [any number], in this order."""
+        self.state.update({name: value[rows] for name, value in per_splat_state(self.state, count).items()})
 
     def take_changes(self, info: Mapping[str, Any], count: int) -> None:
         """Let the window's changes of opacity be at least those of a step."""
@@ -226,45 +225,47 @@ class Densification(ABC):
             self.make_tables([CHANGE], count, info["change"].device)
             self.state[CHANGE].scatter_reduce_(0, info["gaussian_ids"], info["change"], "amax")
 
-    def fitting(self, step: int, info: Mapping[str, Any], splats: Splats, optimizers: Optimizers, wanted: int) -> int:
-        """How many of `wanted` more splats the GPU has memory for. Called in every refinement that may grow.
+    def room_for(self, step: int, info: Mapping[str, Any], splats: Splats, optimizers: Optimizers, wanted: int) -> int:
+        """How many of `wanted` more splats the GPU has memory for. Every refinement that may grow asks, on all devices.
 
-        Where it is fewer, and the limit near, a line says so, and the number then reached is the training's limit: it
-        is in checkpoints, so that a continued training has the same, unless it has more memory, or less. Before it is
-        near, memory may slow growth, which a continued training need not repeat to the bit.
+        Once it is fewer, and the limit near, growth ends there, and a line says so. The limit is in checkpoints: a
+        continued training has the same one, unless it is allowed another amount of memory. While the limit is not near,
+        memory only slows growth, which a continued training need not repeat to the bit.
         """
         count = len(splats["means"])
-        within = self.least(memory.allowed(splats["means"].device))
-        if self.state[HELD] is None or self.state[HELD][1] != within:
-            later = max(self.pixels - info["width"] * info["height"], 0)
-            most = self.least(memory.most_splats(splats, optimizers, later))
-            if self.least(most - count - wanted) >= 0:
+        allowed = self.minimum_of_devices(memory.allowed(splats["means"].device))
+        if self.state[GROWTH_LIMIT] is None or self.state[GROWTH_LIMIT][1] != allowed:
+            later_pixels = max(self.pixels - info["width"] * info["height"], 0)
+            most = self.minimum_of_devices(memory.most_splats(splats, optimizers, later_pixels))
+            if self.minimum_of_devices(most - count - wanted) >= 0:
                 return wanted
-            largest = -self.least(-count)  # the most that a device has
-            if most > NEAR * largest:
+            largest_count = -self.minimum_of_devices(-count)
+            if most > NEAR_LIMIT * largest_count:
                 return min(wanted, most - count)
-            most = max(most, largest)
-            self.state[HELD] = most, within
+            most = max(most, largest_count)
+            self.state[GROWTH_LIMIT] = most, allowed
             if self.verbose:
                 held = f"growth is held at {most:,} splats a GPU, since its memory has no room for more"
                 print(f"Step {step}: {held}. Smaller images or more GPUs make room (docs/troubleshooting.md).")
-        return min(wanted, max(self.state[HELD][0] - count, 0))
+        return min(wanted, max(self.state[GROWTH_LIMIT][0] - count, 0))
 
-    def course(self, step: int, count: int, start: int, stop: int) -> float:
-        """The number of splats that a training with a budget has at a refinement between `start` and `stop`: with x the
-        share of growth that is over, N0 + (2x - x^2) (budget - N0)."""
-        first = self.state[FIRST] = self.state[FIRST] or count
+    def planned_count(self, step: int, count: int, start: int, stop: int) -> float:
+        """The number of splats that a training with a budget should have after a refinement between the steps `start`
+        and `stop`: N0 + (2x - x^2) (budget - N0), with N0 at the first refinement and x in [0, 1] the share of growth
+        that is over."""
+        first = self.state[FIRST_COUNT] = self.state[FIRST_COUNT] or count
         x = min((step - start) / max(stop - start - self.config.refine_every, 1), 1.0)
         return first + (2 * x - x * x) * (self.budget - first)
 
-    def least(self, number: int) -> int:
-        """The least of the devices' numbers; of one device its own."""
+    def minimum_of_devices(self, number: int) -> int:
+        """The smallest of the devices' numbers; with one device the number itself."""
         return number
 
     def mean_opacity(self, logits: Tensor) -> Tensor:
-        """The splats' mean opacity for the loss, a scalar: as the step's cameras are shown them, stored otherwise.
+        """The splats' mean opacity for the loss, a scalar: the shown one of splats that the step's cameras see, the
+        stored one of all others.
 
-        The mean of the stored ones alone would reward a head that lowers what is stored and adds the difference.
+        The mean of stored ones alone would reward low stored opacities to which the head adds the difference.
 
         Args:
             logits: stored opacities [N, 1].
@@ -299,22 +300,21 @@ class Densification(ABC):
     def seen_opacity(self, opacities: Tensor, before: bool = True) -> Tensor:
         """The opacities [N] that decide whether a splat is dead.
 
-        "base": the stored ones. "peak": the largest that a view since the last refinement or reset would show now, or
-        one of the window before, if the strategy keeps it: the stored ones with the largest change by such a view;
-        unchanged where no view has shown the splat. A head whose opacity is the stored one changes nothing, and "peak"
-        is then "base", bit for bit.
+        "base": the stored ones. "peak": the stored ones with the largest change by a view since the last refinement or
+        reset, and by one of the window before, if the strategy keeps it; unchanged where no view has shown the splat.
+        For a head whose opacity is the stored one "peak" is "base", bit for bit.
 
         Args:
             opacities: logits [N, 1].
-            before: look at the window before, too.
+            before: count views of the window before, too.
         """
         stored = torch.sigmoid(opacities.detach().flatten())
         names = (CHANGE, CHANGE_BEFORE) if before else (CHANGE,)
         changes = [self.state[name] for name in names if self.state.get(name) is not None]
-        return seen_with(stored, torch.stack(changes).amax(dim=0)) if changes else stored
+        return shown_opacity(stored, torch.stack(changes).amax(dim=0)) if changes else stored
 
     def begin_another_window(self) -> None:
-        """Start the running maximum anew; strategies with two windows keep the last one as that before."""
+        """Start the running maximum of changes anew; strategies with two windows keep the last as the one before."""
         if self.state.get(CHANGE) is not None:
             if CHANGE_BEFORE in self.state:
                 self.state[CHANGE_BEFORE] = self.state[CHANGE]

@@ -49,7 +49,7 @@ class ShardedModel(NrfgsModel):
         config = self.config.densification.share_of(comm.rank(), comm.world())
         strategy = config.build(self.num_train_data, self.num_views, self.scene_unit)
         strategy.verbose = comm.rank() == 0
-        strategy.least = lambda number: min(comm.gather_counts(number, self.device))
+        strategy.minimum_of_devices = lambda number: min(comm.gather_counts(number, self.device))
         return strategy
 
     def _initial_splats(self) -> dict[str, Tensor]:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
-from nrfgs_ns.densification.strategy import per_splat
+from nrfgs_ns.densification.strategy import per_splat_state
 from nrfgs_ns.distributed import comm
 
 PREFIX = "gauss_params."
@@ -37,7 +37,7 @@ def map_model_rows(state: Mapping[str, Any], change: Callable[[Tensor], Any], pr
     changed."""
     rows = f"{prefix}{PREFIX}"
     extra = state[f"{prefix}_extra_state"]
-    statistics = per_splat(extra["strategy"], len(state[f"{rows}means"]))
+    statistics = per_splat_state(extra["strategy"], len(state[f"{rows}means"]))
     strategy = {**extra["strategy"], **{name: change(value) for name, value in statistics.items()}}
     changed = {name: change(value) if name.startswith(rows) else value for name, value in state.items()}
     return {**changed, f"{prefix}_extra_state": {**extra, "strategy": strategy}}
@@ -91,7 +91,7 @@ def rebalance(
     def moved(rows: Tensor) -> Tensor:
         return torch.cat([rows.index_select(0, staying), comm.swap(rows.index_select(0, going), sent, received)])
 
-    statistics = per_splat(state, count)
+    statistics = per_splat_state(state, count)
     for name in sorted(splats):  # in the same order on all devices
         _update_param_with_optimizer(
             lambda _, old: Parameter(moved(old.detach())), lambda _, old: moved(old), splats, optimizers, names=[name]

@@ -184,7 +184,8 @@ def fit_harmonics(model, cameras: Cameras) -> Fit:
 
     count, device = len(plain.means), model.device
     stride = -(-count // TUNING_SPLATS)
-    moments, kept, held_out = (Moments(size, device) for size in (count, -(-count // stride), -(-count // stride)))
+    moments = Moments(count, device)
+    kept, held_out = (Moments(-(-count // stride), device) for _ in range(2))
     hold_out_every = min(HOLD_OUT_EVERY, len(cameras))
     with progress("Fitting harmonics", len(cameras)) as advance:
         for index in range(len(cameras)):

@@ -25,7 +25,7 @@ STEPS, STEPS_ON_A_CPU, STEPS_OF_A_VIEW = 2500, 400, 10
 RATES = {"opacities": 3.0, "features_dc": 0.15, "features_rest": 0.15}
 """Initial learning rates, times the root mean square difference of the pictures: Adam's steps do not shrink with it.
 They fall to 0 by half a cosine."""
-MOVED = 0.5
+OFFSET = 0.5
 """Root mean square distance of a picture from a training camera, in the cameras' spacing."""
 
 
@@ -51,28 +51,29 @@ def fine_tune(model, splats: PlainSplats, cameras: Cameras, steps: int | None = 
     def picture(of: Field, view: View) -> torch.Tensor:
         return composite_view(view, of.seen_from(view), background, with_depth=False)[0]["rgb"]
 
-    def off_by(index: int, sigma: float) -> torch.Tensor:
-        """Mean squared difference of the pictures `sigma` beside a training view."""
+    def squared_difference(index: int, sigma: float) -> torch.Tensor:
+        """Mean squared difference of the pictures from a random place beside a training camera, `sigma` off in each
+        coordinate."""
         camera = no_larger(cameras[index : index + 1].to(model.device))
-        moved = sigma * torch.randn(3, 1, generator=generator)
-        camera.camera_to_worlds = camera.camera_to_worlds + pad(moved, (3, 0)).to(model.device)
+        offset = sigma * torch.randn(3, 1, generator=generator)
+        camera.camera_to_worlds = camera.camera_to_worlds + pad(offset, (3, 0)).to(model.device)
         with torch.no_grad():
             view = model.project(camera, file.splats)  # the same for both: geometry is not trained
             target = picture(field, view)
         return (picture(file, view) - target).square().mean()
 
     with torch.no_grad():
-        off = torch.stack([off_by(index, 0.0) for index in range(len(cameras))]).mean().sqrt().item()
-    groups = [{"params": [tables[name]], "lr": rate * off} for name, rate in RATES.items()]
+        rms = torch.stack([squared_difference(index, 0.0) for index in range(len(cameras))]).mean().sqrt().item()
+    groups = [{"params": [tables[name]], "lr": rate * rms} for name, rate in RATES.items()]
     optimizer = torch.optim.Adam(groups, eps=1e-15)
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 0.5 * (1 + math.cos(math.pi * step / steps)))
-    sigma = MOVED * camera_spacing(cameras.camera_to_worlds[:, :3, 3]) / math.sqrt(3.0)
+    sigma = OFFSET * camera_spacing(cameras.camera_to_worlds[:, :3, 3]) / math.sqrt(3.0)
     order: list[int] = []
     with progress("Fine-tuning the harmonics", steps) as advance:
         for _ in range(steps):
             order = order or torch.randperm(len(cameras), generator=generator).tolist()
             with torch.enable_grad():
-                loss = off_by(order.pop(), sigma)
+                loss = squared_difference(order.pop(), sigma)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             optimizer.step()

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The splats that a training starts from, as in splatfacto; one of few views starts with points from its photographs,
-beside the capture's own (docs/captures.md)."""
+"""The splats that a training starts from, as in splatfacto. A training of few views also starts with points from its
+photographs (docs/captures.md)."""
 
 from functools import partial
 from typing import Any
@@ -18,9 +18,10 @@ from nrfgs_ns.model.config import NrfgsModelConfig
 from nrfgs_ns.rasterizer import world_to_camera
 
 OPACITY = 0.1
-ALONE = 0.01
+"""Initial opacity of every splat."""
+LONE_STD = 0.01
 """Standard deviation of a single splat, in scene units."""
-NARROWEST = 1e-7
+SMALLEST_STD = 1e-7
 """Smallest standard deviation, in scene units, for points that coincide."""
 
 
@@ -40,10 +41,10 @@ def initial_splats(
         means = (torch.rand(config.num_random, 3) - 0.5) * config.random_scale * scene_unit
         rgb = torch.rand(len(means), 3)
     count = len(means)
-    width = mean_distance(means) if count > 1 else torch.full((count, 1), ALONE * scene_unit)
+    width = mean_distance(means) if count > 1 else torch.full((count, 1), LONE_STD * scene_unit)
     return {
         "means": means,
-        "scales": width.clamp_min(NARROWEST * scene_unit).log().repeat(1, 3),
+        "scales": width.clamp_min(SMALLEST_STD * scene_unit).log().repeat(1, 3),
         "quats": random_quat_tensor(count),
         "opacities": torch.logit(torch.full((count, 1), OPACITY)),
         **head.splat_params(rgb),
@@ -59,16 +60,17 @@ def mean_distance(means: Tensor) -> Tensor:
 
 
 def start_with_dense_points(model: Any, datamanager: Any) -> None:
-    """Let a model that has not been trained start with more points.
+    """Add points from the photographs to a model that has not been trained, if `dense_start` says so.
 
     Args:
         model: an NrfgsModel.
-        datamanager: with its images read.
+        datamanager: its datamanager, with all images read.
     """
-    own = model.seed_points
-    share = share_kept(model.num_views) if model.config.dense_start == "auto" and not model.config.random_init else 0.0
-    if share == 0 or own is None:
+    if model.config.dense_start != "auto" or model.config.random_init or model.seed_points is None:
         return
+    if (share := share_kept(model.num_views)) == 0:
+        return
+    positions, colors = model.seed_points
     cameras = datamanager.train_dataset.cameras.to(model.device)
     images = datamanager.cached_train
     poses = world_to_camera(cameras.camera_to_worlds)
@@ -76,5 +78,5 @@ def start_with_dense_points(model: Any, datamanager: Any) -> None:
     masks = [batch.get("mask") for batch in images]
     views = small_views((batch["image"] for batch in images), masks, intrinsics, poses)
     progress = partial(track, description="Points from photographs", console=CONSOLE, transient=True)
-    xyz, rgb = dense_points(views, own[0].to(poses), share, progress)
-    model.start_from((torch.cat([own[0], xyz.to(own[0])]), torch.cat([own[1], (255 * rgb).to(own[1])])))
+    xyz, rgb = dense_points(views, positions.to(poses), share, progress)
+    model.start_from((torch.cat([positions, xyz.to(positions)]), torch.cat([colors, (255 * rgb).to(colors)])))

@@ -20,7 +20,7 @@ from nerfstudio.utils.colors import get_color
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
-from nrfgs_ns.appearance.head import AppearanceHeadConfig, Field, SplatAppearance, ViewNoise, check_head, failures_told
+from nrfgs_ns.appearance.head import AppearanceHeadConfig, Field, SplatAppearance, ViewNoise, check_head, located_errors
 from nrfgs_ns.data.checks import warn
 from nrfgs_ns.data.views import camera_spacing
 from nrfgs_ns.densification import Densification
@@ -73,7 +73,7 @@ class NrfgsModel(ExportedModel):
         """Depth from which `near_plane` auto draws splats, in world units; a checkpoint keeps its training's."""
         config.appearance.validate()
         self._seed = torch.initial_seed()
-        with failures_told(config.appearance):
+        with located_errors(config.appearance):
             self.head = config.suited_appearance(self.num_views).setup(self.scene_unit)
             splats = self._initial_splats()
             check_head(self.head, splats)
@@ -85,7 +85,7 @@ class NrfgsModel(ExportedModel):
         self.step = 0
         self.crop_box = None
         self.pinholes = Pinholes()
-        self._of_training: dict[tuple[int, int], Pinhole] = {}  # training cameras by index and downscale
+        self._training_pinholes: dict[tuple[int, int], Pinhole] = {}  # training cameras by index and downscale
         is_random = config.background_color == "random"
         self.background_color = torch.tensor(VISER_BACKGROUND) if is_random else get_color(config.background_color)
         self.densification = self._strategy()
@@ -118,7 +118,7 @@ class NrfgsModel(ExportedModel):
         """Learn each photograph's exposure and colour; None: all are the same."""
         self.photograph = None if photographs is None else photographs.to(self.device)
         if self.photograph is not None:
-            self._photograph_asked_for()  # report an unknown name now, not at the first evaluation
+            self._requested_photograph()  # report an unknown name now, not at the first evaluation
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         """One group for each per-splat tensor, "field" for the head's weights, and "photograph" for exposures."""
@@ -182,14 +182,14 @@ class NrfgsModel(ExportedModel):
     def pinhole(self, camera: Cameras) -> Pinhole:
         """The camera for the rasterizer; training cameras whose pose is not learnt are converted once."""
         if not self.training:
-            return self.pinholes.fixed(camera, self.device)
+            return self.pinholes.of_full_size(camera, self.device)
         index = (camera.metadata or {}).get("cam_idx")
         downscale = self._get_downscale_factor()
         if index is None or self.config.camera_optimizer.mode != "off":
             return pinhole(camera, self.camera_optimizer.apply_to_camera(camera), downscale)
-        if (index, downscale) not in self._of_training:
-            self._of_training[index, downscale] = pinhole(camera, camera.camera_to_worlds, downscale)
-        return self._of_training[index, downscale]
+        if (index, downscale) not in self._training_pinholes:
+            self._training_pinholes[index, downscale] = pinhole(camera, camera.camera_to_worlds, downscale)
+        return self._training_pinholes[index, downscale]
 
     def _get_downscale_factor(self) -> int:
         risen = self.schedule_step // self.config.resolution_schedule
@@ -204,13 +204,13 @@ class NrfgsModel(ExportedModel):
         return ProjectionOptions(self.config.rasterize_mode, near, far, assume_finite=self.training)
 
     def _photograph_of(self, camera: Cameras) -> int | None:
-        """The photograph whose look a rendering has: in training the camera's own; None: the mean of all."""
+        """Index of the photograph whose look a rendering has: in training the camera's own; None: the mean of all."""
         if self.training:
             return (camera.metadata or {}).get("cam_idx")
-        return None if self.photograph is None else self._photograph_asked_for()
+        return None if self.photograph is None else self._requested_photograph()
 
-    def _photograph_asked_for(self) -> int | None:
-        """The photograph that LOOK names; None, with a warning, if no exposures have been learnt.
+    def _requested_photograph(self) -> int | None:
+        """Index of the photograph that LOOK names; None, with a warning, if no exposures have been learnt.
 
         Raises:
             InputError: there is no such photograph.
@@ -227,19 +227,19 @@ class NrfgsModel(ExportedModel):
         return names.index(name)
 
     def look_of(self, index: int | None) -> Callable[[Tensor], Tensor] | None:
-        """The learnt look of a photograph, for `composite_view`; None: the mean of all."""
+        """The learnt exposure model of the photograph `index`, for `composite_view`; None: the mean of all."""
         return None if index is None or self.photograph is None else lambda rgb: self.photograph(rgb, index)
 
     def noisy(self, field: Field) -> Field:
-        """A field as its head sees it: in training, under `ViewNoise`."""
+        """A field as its head sees it: in training with means moved by `ViewNoise`."""
         noise = self.view_noise.generator(self.device, self.step) if self.training else None
         return field._replace(splats=self.view_noise.moved(field.splats, noise))
 
     def render_view(
         self, view: View, noisy: Field, look: Callable[[Tensor], Tensor] | None
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Render a view of a field, given as its head sees it, with a look (`look_of`): in evaluation, in the eager and
-        in the recorded step. In training, densification looks at it."""
+        """`composite_view` of a field as its head sees it (`noisy`), with a look (`look_of`): in evaluation, in the
+        eager and in the recorded step. In training, densification looks at it."""
         appearance = noisy.seen_from(view)
         outputs, info = self.composite(view, appearance, look=look)
         if self.training:
@@ -258,16 +258,16 @@ class NrfgsModel(ExportedModel):
         background: Tensor | None = None,
         look: Callable[[Tensor], Tensor] | None = None,
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Composite any appearance of a view as this model is configured (`composite_view`), over a colour [3] instead
-        of the configuration's background if one is given, with a look (`look_of`)."""
+        """`composite_view` of any appearance as this model is configured, with a look (`look_of`), over a background
+        [3] or the configured one."""
         background = self._get_background_color() if background is None else background
         image_of = self.head.image_of if self.head.at_pixel else None
-        how = {"with_depth": not self.training, "absgrad": self.needs_absgrad, "assume_finite": self.training}
-        return composite_view(view, appearance, background, image_of=image_of, look=look, **how)
+        options = {"with_depth": not self.training, "absgrad": self.needs_absgrad, "assume_finite": self.training}
+        return composite_view(view, appearance, background, image_of=image_of, look=look, **options)
 
     @property
     def needs_absgrad(self) -> bool:
-        """Whether densification needs absolute gradients of this step (`Strategy.needs_absgrad`)."""
+        """Whether densification needs absolute gradients of this step (`Densification.needs_absgrad`)."""
         return self.training and self.densification.needs_absgrad(self.step)
 
     def render(self, field: Field, camera: Cameras, noisy: Field) -> dict[str, Tensor]:
@@ -413,7 +413,7 @@ class NrfgsModel(ExportedModel):
         photographs = photographs_of(state)
         if photographs is None or self.photograph is None:  # a training's optimisers hold its own
             self.photograph = None if photographs is None else photographs.to(self.device)
-        self._photograph_asked_for()
+        self._requested_photograph()
         check_compatible(self, state)
         for name, parameter in self.gauss_params.items():
             parameter.data = parameter.data.new_zeros(state[f"gauss_params.{name}"].shape)

@@ -22,8 +22,8 @@ class Pinholes:
         self._on_gpu: OrderedDict[tuple, tuple[list[Tensor], Pinhole]] = OrderedDict()
         self._has_warned = False
 
-    def fixed(self, camera: Cameras, device: torch.device) -> Pinhole:
-        """A camera of full size, a batch of one, [1] or without batch dimension, for a device.
+    def of_full_size(self, camera: Cameras, device: torch.device) -> Pinhole:
+        """A camera of full size, a batch of one, [1] or without batch dimension, on a device.
 
         A camera in host memory costs no wait. To read one on the GPU the host waits for all work there, so the last
         `REMEMBERED` ones are kept until something writes to them.

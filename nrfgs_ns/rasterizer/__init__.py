@@ -109,7 +109,7 @@ def world_to_camera(camera_to_world: Tensor) -> Tensor:
 
 
 class View(NamedTuple):
-    """Splats seen by one camera."""
+    """The splats that a camera, or each of several, sees."""
 
     projection: Projection
     """the visible splats on the image plane, M of them"""
@@ -139,7 +139,7 @@ def load_kernels(device: torch.device) -> None:
 
 
 def project_view(splats: Mapping[str, Tensor], pinhole: Pinhole, options: ProjectionOptions) -> View:
-    """Project a table of splats ("scales" are logarithms) into one camera."""
+    """Project a table of splats into one camera: "means" [N, 3], "quats" [N, 4] and "scales" [N, 3], as logarithms."""
     *camera, center = pinhole
     projection = project(splats["means"], splats["quats"], splats["scales"].exp(), *camera, options)
     return View(projection, center, options.every_row, pinhole)
@@ -190,8 +190,8 @@ def composite_view(
         background: a colour [3].
         with_depth: return depth, too.
         absgrad, assume_finite: as in `composite`.
-        image_of: of a head at the pixel (`AppearanceHead`). Features are composited over zero, and their image is drawn
-            over the background, as opaque as the splats are. None: colours are the image's.
+        image_of: a head at the pixel's (`AppearanceHead.image_of`). Features are composited over zero, and the image of
+            them is drawn over the background with the splats' accumulated opacity. None: colours are the image's.
         look: the photograph's exposure model, applied to the rendered image [H, W, 3]; None: clamp it to [0, 1].
 
     Returns:
@@ -254,7 +254,7 @@ def composite(
     backend = _backend(colors.device, "compositing")
     leave_out = not assume_finite and backend.leaves_out(projection, colors, opacities)
     if not assume_finite and not leave_out:
-        # One such row would spread over every pixel that it covers, and from there into the gradients of all splats.
+        # A row that is not finite would spread over every pixel that it covers, and on into all splats' gradients.
         drawable = torch.isfinite(colors.detach().sum(-1) + opacities.detach())
         colors, opacities = colors.where(drawable[:, None], 0.0), opacities.where(drawable, 0.0)
     if projection.compensations is not None:
@@ -267,8 +267,8 @@ def composite(
     render, alphas, lists = backend.composite(projection, colors, opacities, backgrounds, absgrad, leave_out)
     if with_depth:
         render = torch.cat([render[..., :-1], render[..., -1:] / alphas.clamp(min=1e-10)], dim=-1)
-    kept = "camera_ids", "gaussian_ids", "radii", "means2d", "depths", "conics", "width", "height", "n_cameras"
-    info = {name: getattr(projection, name) for name in kept} | {"opacities": opacities, "tile_size": TILE_SIZE} | lists
+    keys = "camera_ids", "gaussian_ids", "radii", "means2d", "depths", "conics", "width", "height", "n_cameras"
+    info = {key: getattr(projection, key) for key in keys} | {"opacities": opacities, "tile_size": TILE_SIZE} | lists
     info |= {f"tile_{side}": -(-info[side] // info["tile_size"]) for side in ("width", "height")}
     return render, alphas, info
 

@@ -63,7 +63,7 @@ class ParameterMean:
         self.forget()
 
     def state(self) -> dict[str, Any]:
-        """The checkpoint's entry: numbers and tensors."""
+        """`count` and means, for a checkpoint."""
         return {"count": self.count, "means": dict(self._means)}
 
     def load_state(self, state: Mapping[str, Any], optimizers: Mapping[str, Optimizer]) -> None:
@@ -71,7 +71,7 @@ class ParameterMean:
         parameters = _parameters(optimizers)
         shapes = {name: parameter.shape for name, parameter in parameters.items()}
         if {name: mean.shape for name, mean in state["means"].items()} != shapes:
-            return  # the guard has removed splats since
+            return  # the guard has removed splats since the mean was taken
         self.count = state["count"]
         self._means = {name: mean.to(parameters[name]) for name, mean in state["means"].items()}
         self._parameters = parameters

@@ -63,16 +63,16 @@ class LeanOptimizers(Optimizers):
 
     def step(self) -> None:
         """One step of all optimisers."""
-        lean = [optimizer for name, optimizer in self.optimizers.items() if self._is_lean(name)]
-        done = lean if step_at_once(lean) else []
+        plain = [optimizer for name, optimizer in self.optimizers.items() if self._is_plain(name)]
+        stepped = plain if step_at_once(plain) else []
         for name, optimizer in self.optimizers.items():
-            if optimizer not in done:
+            if optimizer not in stepped:
                 if (max_norm := self.config[name]["optimizer"].max_norm) is not None:
                     torch.nn.utils.clip_grad_norm_(parameters_of(optimizer), max_norm)
                 optimizer.step()
 
-    def _is_lean(self, name: str) -> bool:
-        """Whether this is plain fused Adam that has state, which torch builds in its first step."""
+    def _is_plain(self, name: str) -> bool:
+        """Whether an optimiser is fused Adam without clipping that has state, which torch builds in its first step."""
         optimizer = self.optimizers[name]
         return (
             type(optimizer) is Adam
@@ -91,7 +91,7 @@ class LeanOptimizers(Optimizers):
             if step % self.steps_per_log == 0:
                 writer.put_scalar(name=f"learning_rate/{name}", scalar=scheduler.get_last_lr()[0], step=step)
 
-    def hold(self, name: str, parameters: list[Parameter]) -> None:
+    def replace_parameters(self, name: str, parameters: list[Parameter]) -> None:
         """Replace a group's parameters, at its learning rate and schedule."""
         optimizer = self.optimizers[name]
         optimizer.param_groups[0]["params"] = self.parameters[name] = parameters
@@ -101,10 +101,10 @@ class LeanOptimizers(Optimizers):
     def load_optimizers(self, loaded_state) -> None:
         """Load the moments; options such as learning rates stay this training's."""
         for name, state in loaded_state.items():
-            groups = self.optimizers[name].param_groups
-            own = [{key: value for key, value in group.items() if key != "params"} for group in groups]
-            self.optimizers[name].load_state_dict(state)
-            for group, options in zip(self.optimizers[name].param_groups, own, strict=True):
+            optimizer = self.optimizers[name]
+            options_before = [{k: v for k, v in group.items() if k != "params"} for group in optimizer.param_groups]
+            optimizer.load_state_dict(state)
+            for group, options in zip(optimizer.param_groups, options_before, strict=True):
                 group.update(options)
         self.fuse()
 
@@ -114,16 +114,16 @@ class LeanOptimizers(Optimizers):
             scheduler = self.schedulers[name]
             scheduler.load_state_dict({**state, "base_lrs": scheduler.base_lrs})
             rates = scheduler.get_last_lr()
-            if isinstance(scheduler, LambdaLR):  # of this training's rates, not the checkpoint's
-                shares = (share(scheduler.last_epoch) for share in scheduler.lr_lambdas)
-                rates = [base * share for base, share in zip(scheduler.base_lrs, shares, strict=True)]
+            if isinstance(scheduler, LambdaLR):  # the state holds the checkpoint's rates, not this training's
+                pairs = zip(scheduler.base_lrs, scheduler.lr_lambdas, strict=True)
+                rates = [base * factor(scheduler.last_epoch) for base, factor in pairs]
             for group, rate in zip(self.optimizers[name].param_groups, rates, strict=True):
                 group["lr"] = rate
 
 
 def step_at_once(optimizers: Sequence[Adam]) -> bool:
-    """Make one step of several fused Adams that have state, in one Triton kernel, if it can; as in torch, the step is
-    skipped where `found_inf` (a tensor on the device) is 1. Returns whether the step was made."""
+    """Make one step of several fused Adams that have state by one Triton kernel, if it runs; returns whether it did. As
+    in torch, the step changes nothing where the optimisers' `found_inf`, a tensor on the device, is 1."""
     work: list[tuple[dict[str, Any], list[Tensor], list[dict[str, Tensor]]]] = []
     for optimizer in optimizers:
         for group in optimizer.param_groups:
@@ -147,7 +147,7 @@ def step_at_once(optimizers: Sequence[Adam]) -> bool:
 
 @tried_once("Adam")
 def try_kernel(device: torch.device) -> None:
-    """Whether Adam's kernel runs on a CUDA device; the first step would compile it."""
+    """Whether Adam's kernel runs on a CUDA device; compiles it before the first step."""
     from nrfgs_ns.training.adam_triton import AdamTable
 
     number = Parameter(torch.ones(1, device=device))

@@ -70,7 +70,7 @@ class Pace:
         return now + math.ceil(ahead - ROUNDING) if ahead > -ROUNDING else 0
 
     def state(self) -> dict[str, Any]:
-        """The checkpoint's entry."""
+        """The position on the schedules, for a checkpoint."""
         return {"length": self.length, "rate": self.rate, "position": self.position}
 
     def load_state(self, state: dict[str, Any]) -> None:
@@ -93,16 +93,16 @@ class TimedPace(Pace):
         self.seconds = seconds
         self.phases = phases or [(math.inf, 1.0)]
         self.clock = clock
-        self.earlier = 0.0
+        self.earlier_seconds = 0.0
         """seconds before the checkpoint that the training goes on from"""
-        self._started: float | None = None
-        self._begun: float | None = None
+        self._training_began: float | None = None
+        self._step_began: float | None = None
         self._durations: deque[float] = deque(maxlen=STEPS_IN_MEDIAN)
 
     @property
     def elapsed(self) -> float:
         """Seconds of training, without interruptions."""
-        return self.earlier + (0.0 if self._started is None else self.clock() - self._started)
+        return self.earlier_seconds + (0.0 if self._training_began is None else self.clock() - self._training_began)
 
     @property
     def step_seconds(self) -> float:
@@ -122,31 +122,35 @@ class TimedPace(Pace):
         return math.ceil((self.length - self.position) / self.rate)
 
     def start(self) -> None:
-        self._started = self.clock()
-        self._begun = None
+        self._training_began = self.clock()
+        self._step_began = None
 
     def begin_step(self) -> None:
         now = self.clock()
-        if self._begun is not None:
-            self._durations.append(now - self._begun)
-        self._begun = now
+        if self._step_began is not None:
+            self._durations.append(now - self._step_began)
+        self._step_began = now
 
     def advance(self) -> None:
         if len(self._durations) >= STEPS_BEFORE_PLANNING:
             step = self.step_seconds
             # The schedules' last position is for the last step, not for one behind it.
-            left = max(self.seconds - self.elapsed, step)
-            work = 0.0  # at rate 1, in steps of the present cost
-            begin = self.position
-            present = None
-            for end, cost in self.phases:
-                end = min(end, float(self.length))
-                if end > begin:
-                    present = present or cost
-                    work += (end - begin) * cost / present
-                    begin = end
-            self.rate = max(step / left * work, 1e-9)
+            seconds_left = max(self.seconds - self.elapsed, step)
+            self.rate = max(step / seconds_left * self._cost_ahead(), 1e-9)
         super().advance()
+
+    def _cost_ahead(self) -> float:
+        """The integral in the module's docstring: the cost of the way to L at rate 1, in steps of the present cost."""
+        total = 0.0
+        begin = self.position
+        present_cost = None
+        for end, cost in self.phases:
+            end = min(end, float(self.length))
+            if end > begin:
+                present_cost = present_cost or cost
+                total += (end - begin) * cost / present_cost
+                begin = end
+        return total
 
     def state(self) -> dict[str, Any]:
         # A budget that is spent but for half a step is spent.
@@ -155,7 +159,7 @@ class TimedPace(Pace):
 
     def load_state(self, state: dict[str, Any]) -> None:
         super().load_state(state)
-        self.earlier = state.get("seconds", 0.0)
+        self.earlier_seconds = state.get("seconds", 0.0)
 
 
 def resolution_phases(num_downscales: int, resolution_schedule: int) -> Phases:

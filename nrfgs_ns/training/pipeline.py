@@ -121,7 +121,9 @@ class NrfgsPipeline(VanillaPipeline):
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint, or the compact file that the configuration names; InputError if it does not fit.
-        On another data set no training goes on; what is finished can still be looked at."""
+
+        A training does not go on with another data set; other commands load the model with a warning.
+        """
         training = self.test_mode == "val"
         if (scene := loaded_state.get("_extra_state", {}).get("scene")) is not None:  # a compact file has none
             try:
@@ -170,9 +172,9 @@ class NrfgsPipeline(VanillaPipeline):
         if output_path is not None:
             output_path.mkdir(exist_ok=True, parents=True)
         names = picture_names(self.datamanager.eval_dataset.image_filenames)
-        pairs = list(zip(names, self.datamanager.fixed_indices_eval_dataloader, strict=True))
+        views = list(zip(names, self.datamanager.fixed_indices_eval_dataloader, strict=True))
         per_image: list[dict[str, Any]] = []
-        for index, (name, (camera, batch)) in enumerate(track(pairs, "Evaluating", console=CONSOLE, transient=True)):
+        for index, (name, (camera, batch)) in enumerate(track(views, "Evaluating", console=CONSOLE, transient=True)):
             start = perf_counter()
             outputs = self.model.get_outputs_for_camera(camera=camera)
             if outputs["rgb"].is_cuda:
@@ -185,17 +187,9 @@ class NrfgsPipeline(VanillaPipeline):
                 save_image(picture.permute(2, 0, 1).cpu(), file)
         self.train()
 
-        result: dict[str, Any] = {}
-        for metric in METRIC_NAMES:
-            values = [image[metric] for image in per_image if metric in image]
-            if values or get_std:
-                result[metric] = fmean(values) if values else None
-            if get_std:
-                spread = torch.tensor(values, dtype=torch.float64)  # statistics.stdev takes no infinity
-                result[f"{metric}_std"] = float(spread.std()) if len(values) > 1 else None
         seconds = fmean(image["seconds_per_image"] for image in per_image[1:] or per_image)
-        result |= {"seconds_per_image": seconds, "fps": 1.0 / seconds, "splats": self.model.num_splats}
-        result["parameter_bytes"] = self.model.parameter_bytes
+        result = means_of(per_image, get_std) | {"seconds_per_image": seconds, "fps": 1.0 / seconds}
+        result |= {"splats": self.model.num_splats, "parameter_bytes": self.model.parameter_bytes}
         if get_std:
             result["per_image"] = per_image
             print_evaluation(result)
@@ -229,26 +223,39 @@ class NrfgsPipeline(VanillaPipeline):
 
 
 def kernels_of(head: AppearanceHead) -> tuple[Callable[[torch.device], object], ...]:
-    """Trials of what a training runs on a CUDA device: gsplat's kernels, which raise what goes wrong, then Triton's."""
+    """Trials of a training's kernels on a CUDA device: gsplat's, whose trial raises what goes wrong, then Triton's."""
     return load_kernels, head.try_kernels, ssim.kernels_run_on, statistics.try_kernel, optimizers.try_kernel
+
+
+def means_of(per_image: list[dict[str, Any]], with_deviations: bool) -> dict[str, Any]:
+    """Means of `METRIC_NAMES` over images, and their standard deviations ("..._std") and nulls if wanted."""
+    result: dict[str, Any] = {}
+    for metric in METRIC_NAMES:
+        values = [image[metric] for image in per_image if metric in image]
+        if values or with_deviations:
+            result[metric] = fmean(values) if values else None
+        if with_deviations:
+            numbers = torch.tensor(values, dtype=torch.float64)  # statistics.stdev takes no infinity
+            result[f"{metric}_std"] = float(numbers.std()) if len(values) > 1 else None
+    return result
 
 
 def print_evaluation(result: Mapping[str, Any]) -> None:
     """Print the means over the test views, the worst view, and how to get LPIPS where it is missing."""
     names = [name for name in SHOWN if result.get(name) is not None]
     views = result["per_image"]
-    known = sorted((view["psnr"], view["image"]) for view in views if view.get("psnr") is not None)
+    ranked = sorted((view["psnr"], view["image"]) for view in views if view.get("psnr") is not None)
     title = "One test view: not a mean, and no measure of the whole"
-    CONSOLE.print(title if len(known) == 1 else f"Means over {len(known)} test views", soft_wrap=True)
+    CONSOLE.print(title if len(ranked) == 1 else f"Means over {len(ranked)} test views", soft_wrap=True)
     table = Table(*(Column(name, justify="right") for name in names))
     table.add_row(*(f"{result[name]:,}" if name == "splats" else f"{result[name]:.4g}" for name in names))
     CONSOLE.print(table)
     if masked := [view["image"] for view in views if view.get("psnr") is None]:
         warn(f"Masks leave nothing to measure of {some(masked)}.")
-    if len(known) > 1:
-        worst, name = known[0]
-        middle = median(value for value, _ in known)
-        line = f"Median view {middle:.1f} dB. Worst {worst:.1f} dB: {name}. Pictures: --render-output-path FOLDER"
+    if len(ranked) > 1:
+        worst, worst_view = ranked[0]
+        middle = median(value for value, _ in ranked)
+        line = f"Median view {middle:.1f} dB. Worst {worst:.1f} dB: {worst_view}. Pictures: --render-output-path FOLDER"
         CONSOLE.print(line, markup=False, soft_wrap=True)
     if result.get("lpips") is None and (advice := lpips_advice()) is not None:
         CONSOLE.print(advice, markup=False, soft_wrap=True)

@@ -6,8 +6,8 @@ A step launches a hundred kernels, and the host takes longer to launch them than
 and launched as a whole from then on, with another camera, photograph and noise.
 
 Sizes must not differ between steps: all splats have a row, visible or not, and the tiles' lists have room for 1.5 times
-the pairs of recent views. If a view needs more, which the host learns a step later, its farthest splats are left out of
-that step, and there is more room from then on.
+the (splat, tile) pairs of recent views. If a view has more pairs, its farthest splats are left out of that step; the
+host learns it a step later and makes more room.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from nrfgs_ns.model.loss import loss_of
 from nrfgs_ns.rasterizer import Pinhole, composite_view, project_view
 
 MORE_ROOM = 1.5
-"""Room for pairs of splats and tiles, relative to the view that has most."""
-VIEWS_ASKED = 20
+"""Room for (splat, tile) pairs, relative to the view that has most."""
+VIEWS_COUNTED = 20
 """Views in which pairs are counted."""
 MOST_SIZES = 4
-"""Sizes of photographs that are recorded while splats grow, after each refinement anew. Later further sizes are, unless
-more than half of the GPU's memory is in use. Other steps run kernel by kernel."""
+"""Sizes of photographs that are recorded while densification goes on, after each refinement anew. Afterwards further
+sizes are recorded unless more than half of the GPU's memory is in use. Steps of other sizes run kernel by kernel."""
 
 
 class StepGraphs:
@@ -43,34 +43,34 @@ class StepGraphs:
 
     Args:
         model: an NrfgsModel.
-        datamanager: of its training.
-        guard: of its training; its verdict on the step before is read once, before a step is computed.
+        datamanager: its training's.
+        guard: its training's. Its verdict on the step before is read once, before a step is computed.
     """
 
     def __init__(self, model, datamanager, guard):
         self.model, self.datamanager, self.guard = model, datamanager, guard
         self._graphs: dict[tuple, _StepGraph] = {}
-        self._of: list[Any] = []
-        """the splats' parameters and the head that were recorded"""
-        self._how: dict[str, Any] = {}
-        """what else differs between recordings: phases, places in memory, the resolution"""
-        self._pairs_for_each = 0.0
-        """the most pairs of a view, for each splat, at this resolution"""
-        self._place: tuple = ()
-        """a pool of memory and a stream, of all graphs"""
+        self._recorded: list[Any] = []
+        """the splats' parameters and the head that the graphs hold, kept so that their ids stay theirs"""
+        self._settings: dict[str, Any] = {}
+        """what the graphs depend on: ids of those objects, their places in memory, phases, the resolution"""
+        self._pairs_per_splat = 0.0
+        """the most pairs of a view at this resolution, divided by the number of splats"""
+        self._pool_and_stream: tuple = ()
+        """a memory pool and a stream, shared by all graphs"""
         self._given_up = False
-        self._said: set[str] = set()
+        self._reported: set[str] = set()
 
-    def _takes(self, batch: Mapping[str, Any]) -> bool:
+    def _can_record(self, batch: Mapping[str, Any]) -> bool:
         """Whether this step can be recorded; each thing that prevents it is reported once."""
         model = self.model
         if self._given_up or model.device.type != "cuda" or model.num_points == 0:
             return False
         if (obstacle := self._obstacle(batch)) is not None:
-            self._is_new()  # graphs of splats that are gone would keep their memory
-            if obstacle not in self._said:
+            self._drop_if_outdated()  # graphs of replaced splats would keep their memory
+            if obstacle not in self._reported:
                 CONSOLE.print(f"Steps are not recorded as a CUDA graph, and take longer: {obstacle}.", soft_wrap=True)
-                self._said.add(obstacle)
+                self._reported.add(obstacle)
             return False
         # Smaller images go to pytorch_msssim, which copies its window from the host.
         return min(batch["image"].shape[:2]) // model._get_downscale_factor() >= WINDOW_SIZE
@@ -86,7 +86,7 @@ class StepGraphs:
             ("the head's network sees pixels", model.head.at_pixel),
             ("photographs have many sizes, and only some of them are recorded", self._is_one_too_many(batch)),
         )
-        return next((what for what, there in obstacles if there), None)
+        return next((obstacle for obstacle, is_present in obstacles if is_present), None)
 
     def _is_one_too_many(self, batch: Mapping[str, Any]) -> bool:
         """Whether the photograph is of a kind that has no graph and gets none."""
@@ -95,24 +95,26 @@ class StepGraphs:
         return not self.model.densification.rests_at(self.model.step) or memory.share_used(self.model.device) > 0.5
 
     def prepare(self, camera: Cameras, batch: Mapping[str, Any], step: int) -> bool:
-        """Whether `run` can make this step, which it is then ready for. False where the step is the first of its kind,
-        or cannot be recorded; TrainingStopped where the step before was condemned."""
-        if not self._takes(batch) or self._is_new():
+        """Prepare `run` for a step; returns whether it can make it.
+
+        It cannot where recording is impossible or fails, and in the first step since graphs became outdated. Raises
+        TrainingStopped if the step before met a number that is not finite.
+        """
+        if not self._can_record(batch) or self._drop_if_outdated():
             self.guard.settle()
             return False
-        seen_from = self.model.pinhole(camera)
-        now = seen_from, batch, camera.metadata["cam_idx"], step
+        inputs = self.model.pinhole(camera), batch, camera.metadata["cam_idx"], step
         kind = _kind(batch)
         if (graph := self._graphs.get(kind)) is not None:
-            graph.prepare(*now)
-        self.guard.settle()  # everything is ready, so that the GPU need not wait for what the host does
+            graph.prepare(*inputs)
+        self.guard.settle()  # the host waits for the GPU: all else is ready, so that the GPU need not wait in turn
         if graph is None or not graph.had_room():
-            self._record(kind, *now)
+            self._record(kind, *inputs)
         return kind in self._graphs
 
     def run(self, batch: Mapping[str, Any]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """The outputs and losses of the step that has been prepared, detached: the parameters have the gradients of the
-        losses' sum."""
+        """Make the prepared step: returns its outputs and losses, detached, and leaves the gradients of the losses' sum
+        in the parameters."""
         model = self.model
         graph = self._graphs[_kind(batch)]
         losses = graph.run()
@@ -120,43 +122,44 @@ class StepGraphs:
         model.watch(graph.outputs, losses, batch)
         return dict(graph.outputs), dict(losses)
 
-    def _is_new(self) -> bool:
-        """Whether a step differs from the recorded ones: in its splats, in its resolution, or in what the head or the
-        densification does."""
+    def _drop_if_outdated(self) -> bool:
+        """Drop all graphs, and return True, where the step differs from the recorded ones in its splats, its resolution
+        or the phase of head or densification."""
         model = self.model
         splats = list(model.gauss_params.values())
-        now = [*splats, model.head]  # whose weights live as long as it does
-        how = {
+        objects = [*splats, model.head]  # the head's weights live as long as it does
+        settings = {
+            "objects": [id(value) for value in objects],
             "places": [value.data_ptr() for value in splats],
             "head": model.head.phase,
             "densification": model.densification.rests_at(model.step),
             "trims": model.trimming is not None and model.trimming.is_on(model.schedule_step),
             "downscale": model._get_downscale_factor(),
         }
-        same = len(now) == len(self._of) and all(a is b for a, b in zip(now, self._of, strict=True))
-        if same and how == self._how:
+        if settings == self._settings:
             return False
-        self._see_pairs()
-        if how["downscale"] != self._how.get("downscale"):
-            self._pairs_for_each = 0.0
+        self._update_pairs()
+        if settings["downscale"] != self._settings.get("downscale"):
+            self._pairs_per_splat = 0.0
         if self._graphs:
             self._graphs.clear()
             torch.cuda.empty_cache()  # which alone frees a graph's memory for others
-        self._of, self._how = now, how
+        self._recorded, self._settings = objects, settings
         return True
 
-    def _record(self, kind: tuple, seen_from: Pinhole, batch: Mapping[str, Any], index: int, step: int) -> None:
-        """Record a graph for this kind of photograph, prepared for a step; if that fails, no step from now on."""
-        self._see_pairs()
+    def _record(self, kind: tuple, pinhole: Pinhole, batch: Mapping[str, Any], index: int, step: int) -> None:
+        """Record a graph for this kind of photograph and prepare it for a step; if that fails, record none from now
+        on."""
+        self._update_pairs()
         self._graphs.pop(kind, None)
         try:
-            if self._pairs_for_each == 0.0:
-                self._pairs_for_each = self._most_pairs() / self.model.num_points
-            room = int(MORE_ROOM * self._pairs_for_each * self.model.num_points) + 1
+            if self._pairs_per_splat == 0.0:
+                self._pairs_per_splat = self._most_pairs() / self.model.num_points
+            room = int(MORE_ROOM * self._pairs_per_splat * self.model.num_points) + 1
             if not self._graphs:  # a pool's memory is free for others when all its graphs are gone
-                self._place = torch.cuda.graph_pool_handle(), torch.cuda.Stream(self.model.device)
-            graph = self._graphs[kind] = _StepGraph(self.model, seen_from, batch, room, self._place)
-            graph.prepare(seen_from, batch, index, step)
+                self._pool_and_stream = torch.cuda.graph_pool_handle(), torch.cuda.Stream(self.model.device)
+            graph = self._graphs[kind] = _StepGraph(self.model, pinhole, batch, room, *self._pool_and_stream)
+            graph.prepare(pinhole, batch, index, step)
         except Exception as error:
             self._given_up = True
             self._graphs.clear()
@@ -164,21 +167,21 @@ class StepGraphs:
             reason = next(iter(str(error).splitlines()), "")
             warn(f"Steps are made kernel by kernel: their graph failed ({type(error).__name__}: {reason}).")
 
-    def _see_pairs(self) -> None:
-        """Learn from the present graphs how many pairs views have."""
+    def _update_pairs(self) -> None:
+        """Raise `_pairs_per_splat` to the most that the present graphs have met."""
         for graph in self._graphs.values():
-            self._pairs_for_each = max(self._pairs_for_each, graph.most_pairs() / graph.count)
+            self._pairs_per_splat = max(self._pairs_per_splat, graph.most_pairs() / graph.count)
 
     def _most_pairs(self) -> int:
-        """The most pairs of any of `VIEWS_ASKED` views in the tiles of images with gradients; RuntimeError where gsplat
-        makes the lists, not `tile_lists.py`."""
+        """The most pairs of any of about `VIEWS_COUNTED` views; RuntimeError where gsplat makes the tiles' lists, not
+        `tile_lists.py`."""
         from nrfgs_ns.rasterizer.tile_lists import FixedRoom
 
         model = self.model
         field = model.field
         room = FixedRoom(1, model.device)
         count = len(self.datamanager.train_dataset)
-        for index in range(0, count, max(count // VIEWS_ASKED, 1)):
+        for index in range(0, count, max(count // VIEWS_COUNTED, 1)):
             camera, _ = self.datamanager.train_view(index)
             view = model.project(camera, field.splats)
             with room.in_use():
@@ -199,44 +202,46 @@ class _StepGraph:
 
     Args:
         model: an NrfgsModel in training.
-        seen_from, batch: some camera, and its photograph and mask as the datamanager gives them.
-        pairs: how many the lists have room for.
-        place: a pool of memory and a stream, for all graphs. What a graph needs only while it runs, others use again;
-            what it leaves lasts until the next one runs.
+        pinhole, batch: some camera, and its photograph and mask as the datamanager gives them.
+        pairs: number of pairs for which the tiles' lists have room.
+        pool: memory that all graphs share: a graph's outputs last until the next one runs.
+        stream: the stream on which all are recorded.
     """
 
-    def __init__(self, model, seen_from: Pinhole, batch: Mapping[str, Any], pairs: int, place: tuple):
+    def __init__(self, model, pinhole: Pinhole, batch: Mapping[str, Any], pairs: int, pool: Any, stream: Any):
         from nrfgs_ns.rasterizer.tile_lists import FixedRoom
 
         self.model, self.count = model, model.num_points
         self.parameters = {f"splats.{name}": value for name, value in model.gauss_params.items()}
         self.parameters |= {f"head.{name}": value for name, value in model.head.named_parameters()}
         self.device = device = model.device
-        self.seen_from = seen_from._replace(
-            viewmat=seen_from.viewmat.clone(), K=seen_from.K.clone(), center=seen_from.center.clone()
-        )
+        matrices = {name: getattr(pinhole, name).clone() for name in ("viewmat", "K", "center")}
+        self.pinhole = pinhole._replace(**matrices)
         self.batch = {name: batch[name].to(device, copy=True) for name in ("image", "mask") if name in batch}
         self.room = FixedRoom(pairs, device)
         self._counted = torch.ones(2, dtype=torch.int64, pin_memory=True)
         self._arrived = torch.cuda.Event()
         self._arrived.record()
         self.last_pairs = 1
-        """of the step before, as far as the host knows"""
+        """number of pairs in the step before, as far as the host knows"""
         self.shot = None if model.photograph is None else model.photograph.shots.detach()[:1].clone()
         """the step's row of a learnt exposure model, [1, R], which a graph cannot select by itself"""
         self.noise = model.view_noise.generator(device, 0)
+        self._capture(pool, stream)
 
+    def _capture(self, pool: Any, stream: Any) -> None:
+        """Record the step, which runs once before: random generators and residuals are set back in between."""
+        model, device = self.model, self.device
         generators = [torch.cuda.default_generators[device.index], *([] if self.noise is None else [self.noise])]
         states = [generator.get_state() for generator in generators]
         self.graph = torch.cuda.CUDAGraph()
         if self.noise is not None:
             self.graph.register_generator_state(self.noise)
-        pool, aside = place
-        now = torch.cuda.current_stream(device)
+        current = torch.cuda.current_stream(device)
         residuals = None if model.trimming is None else model.trimming.histogram.clone()
-        aside.wait_stream(now)
+        stream.wait_stream(current)
         try:
-            with torch.cuda.stream(aside):
+            with torch.cuda.stream(stream):
                 self._compute()  # once outside the recording: first calls compile and allocate
                 for generator, state in zip(generators, states, strict=True):
                     generator.set_state(state)
@@ -254,7 +259,7 @@ class _StepGraph:
                 generator.set_state(state)
             raise
         finally:
-            now.wait_stream(aside)
+            current.wait_stream(stream)
 
     def _compute(self) -> None:
         """One step's rendering, loss and gradients, from and to tensors that stay where they are.
@@ -272,7 +277,7 @@ class _StepGraph:
             shot = self.shot.detach().requires_grad_()
             look = lambda rgb: functional_call(model.photograph, {"shots": shot}, (rgb, 0))  # noqa: E731
         with torch.enable_grad(), self.room.in_use():
-            view = project_view(splats, self.seen_from, replace(model.projection_options, every_row=True))
+            view = project_view(splats, self.pinhole, replace(model.projection_options, every_row=True))
             noisy = Field(head, model.view_noise.moved(splats, self.noise))
             outputs, info = model.render_view(view, noisy, look)
             losses = loss_of(model, splats, outputs, self.batch)
@@ -299,10 +304,10 @@ class _StepGraph:
         self._arrived.synchronize()
         return int(self._counted[1])
 
-    def prepare(self, seen_from: Pinhole, batch: Mapping[str, Any], index: int, step: int) -> None:
-        """Copy in a step's camera, noise and training photograph, number `index`."""
-        mine = self.seen_from
-        torch._foreach_copy_([mine.viewmat, mine.K, mine.center], [seen_from.viewmat, seen_from.K, seen_from.center])
+    def prepare(self, pinhole: Pinhole, batch: Mapping[str, Any], index: int, step: int) -> None:
+        """Copy in a step's camera, photograph (number `index` of the training), mask and noise."""
+        own = self.pinhole
+        torch._foreach_copy_([own.viewmat, own.K, own.center], [pinhole.viewmat, pinhole.K, pinhole.center])
         for name, values in self.batch.items():
             values.copy_(batch[name], non_blocking=True)
         self.model.view_noise.generator(self.device, step)  # the same, with this step's seed

@@ -50,6 +50,7 @@ class NrfgsTrainer(Trainer):
         pace: position on the schedules; None: the step.
         steps_are_chosen: whether the number of training views decides how many steps there are.
         mean: the parameters' mean over the last steps; None without `average_steps`.
+        graphs: recorded steps; None with several devices.
     """
 
     def __init__(self, config: NrfgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
@@ -89,8 +90,8 @@ class NrfgsTrainer(Trainer):
         self.line = next((log for log in writer.EVENT_WRITERS if isinstance(log, ProgressLine)), None)
         if self.line is not None and self.world_size == 1:  # with several, no device can draw alone
             self.line.watch(self.pipeline, self.train_lock)
-        self._made = self._start_step - 1
-        """the last completed step"""
+        self._completed_step = self._start_step - 1
+        """the last step that was completed"""
         if self.world_size == 1:
             self.graphs = StepGraphs(self.pipeline.model, self.pipeline.datamanager, self.guard)
         if comms.is_main_process():
@@ -114,8 +115,7 @@ class NrfgsTrainer(Trainer):
         self.mean = ParameterMean() if self.config.average_steps > 0 else None
         self.pace = self.config.pace()
         groups = self.pipeline.get_param_groups()
-        every = self.config.logging.steps_per_log
-        return LeanOptimizers(self.optimizer_configs(), groups, every, self.pace)
+        return LeanOptimizers(self.optimizer_configs(), groups, self.config.logging.steps_per_log, self.pace)
 
     # Resuming.
 
@@ -142,34 +142,35 @@ class NrfgsTrainer(Trainer):
             longer = f"--max-num-iterations {2 * self._start_step}{schedules} makes as many more"
             raise InputError(f"{path} is the end of a training of {self._start_step:,} steps: {longer}.")
         if weights := list(self.pipeline.model.head.parameters()):  # of a smaller head, perhaps, than was built
-            self.optimizers.hold("field", weights)
+            self.optimizers.replace_parameters("field", weights)
         self.optimizers.load_optimizers(content["optimizers"])
         if "schedulers" in content and config.load_scheduler:
             self.optimizers.load_schedulers(content["schedulers"])
-        self._follow(training.get("pace"))
+        self._resume_pace(training.get("pace"))
         if self.mean is not None and self.mean.is_saved and training.get("parameter_mean") is not None:
             self.mean.load_state(training["parameter_mean"], self.optimizers.optimizers)
         budget = config.time_budget
         total = f"{self.total_steps:,}" if budget is None else f"as many as fit into {budget:g} minutes"
         CONSOLE.print(f"Going on from {path}, at step {self._start_step} of {total}.", markup=False, soft_wrap=True)
 
-    def _follow(self, written: dict[str, Any] | None) -> None:
-        """Go on from the checkpoint's position on the schedules; the remaining steps walk through the rest."""
+    def _resume_pace(self, saved: dict[str, Any] | None) -> None:
+        """Go on from the position on the schedules in a checkpoint (`Pace.state`; None: those were not stretched). The
+        remaining steps walk through the rest."""
         pace = self.pace
-        if written is not None and (pace is None or type(pace) is Pace and pace.length != written["length"]):
-            same = "a --time-budget" if "seconds" in written else f"--schedule-steps {written['length']}"
-            fix = f"Go on with {same}" if self.world_size == 1 else "Go on with one device"
+        if saved is not None and (pace is None or type(pace) is Pace and pace.length != saved["length"]):
+            option = "a --time-budget" if "seconds" in saved else f"--schedule-steps {saved['length']}"
+            fix = f"Go on with {option}" if self.world_size == 1 else "Go on with one device"
             raise InputError(f"The schedules of the checkpoint's training are stretched. {fix}, or train anew.")
         if not isinstance(pace, TimedPace):
             self.config = replace(self.config, max_num_iterations=self.total_steps - self._start_step)
         if pace is None:
             return
-        if written is not None:
-            pace.load_state(written)
+        if saved is not None:
+            pace.load_state(saved)
         elif pace.length < (step := self._start_step):
             raise InputError(f"Schedules of {pace.length} steps end before step {step}. Give more --schedule-steps.")
         else:
-            pace.position = float(step)  # the checkpoint's schedules were not stretched
+            pace.position = float(step)
         if not isinstance(pace, TimedPace):
             rate = (pace.length - pace.position) / self.config.max_num_iterations
             if not math.isclose(rate, pace.rate, rel_tol=1e-9):  # an unchanged rate stays the same to the last bit
@@ -249,7 +250,7 @@ class NrfgsTrainer(Trainer):
             self.guard.before_optimizers(optimizers)
             optimizers.step()
             optimizers.scheduler_step_all(step)
-        self._made = step
+        self._completed_step = step
         if pace is not None:
             model.schedule_at(int(pace.position))
         if isinstance(pace, TimedPace):
@@ -268,11 +269,10 @@ class NrfgsTrainer(Trainer):
         timed = isinstance(self.pace, TimedPace)
         left = self.pace.steps_left if timed else self.last_step - step  # timed: an estimate
         size = window(self.config.average_steps, step + 1 + left)
-        # A timed window stays once begun, unless the estimate was far off; otherwise the mean may be of steps that were
+        # A timed window stays once begun, unless the estimate was far off. Otherwise the mean may be of steps that were
         # the last before the training was extended.
-        if left >= 2 * size if timed else mean.count >= size - left:
-            mean.forget()
-        if self.pipeline.model.densification.moved_at == step:
+        is_stale = left >= 2 * size if timed else mean.count >= size - left
+        if is_stale or self.pipeline.model.densification.moved_at == step:
             mean.forget()
         if left < size or mean.count > 0:
             mean.add(self.optimizers.optimizers)
@@ -280,24 +280,25 @@ class NrfgsTrainer(Trainer):
     # The end.
 
     def _after_train(self) -> None:
-        """Nerfstudio's, whose step number is one too high after an early stop. The mean becomes the model."""
-        self.step = self._made
+        """Nerfstudio's, with the right step number: its own is one too high after an early stop. Before it, the mean
+        becomes the model; a signal ends the training here."""
+        self.step = self._completed_step
         self._is_ending = True
         timed_out = isinstance(self.pace, TimedPace) and self.pace.is_spent
-        if self._signal and not timed_out and self._made < self.last_step:
+        if self._signal and not timed_out and self._completed_step < self.last_step:
             outcome = NOTHING_TO_SAVE
-            if self._made >= self._start_step:
-                outcome = f"Stopped at step {self._made}, saved. {self._save_once()}"
+            if self._completed_step >= self._start_step:
+                outcome = f"Stopped at step {self._completed_step}, saved. {self._save_once()}"
             self._end(outcome, 128 + self._signal)
-        self.take_the_mean(stopped=self._stop and not timed_out)
+        self.install_mean(stopped=self._stop and not timed_out)
         if self.line is not None:
-            self.line.finish(self._made)
+            self.line.finish(self._completed_step)
         super()._after_train()
 
     def _save_once(self) -> str:
-        """Save the last completed step unless it has been; returns how to go on."""
-        if self._saved_step != self._made:
-            self.save_checkpoint(self._made)
+        """Save the last completed step unless it is saved; returns a sentence, without full stop, on how to go on."""
+        if self._saved_step != self._completed_step:
+            self.save_checkpoint(self._completed_step)
         return f"Go on with the same command and --load-dir {quote(str(self.checkpoint_dir))}"
 
     def _end(self, line: str, status: int) -> None:
@@ -328,9 +329,9 @@ class NrfgsTrainer(Trainer):
                 raise
             error.__traceback__ = None  # its frames hold the step's tensors
             outcome = self._save_last_step()
-            what = str(error).partition("\n")[0]
-            message = f"Out of memory in step {self.step}: {what}\n{outcome} Fewer splats or smaller images take less"
-            savable = self._saved_step == self._made
+            reason = str(error).partition("\n")[0]
+            message = f"Out of memory in step {self.step}: {reason}\n{outcome} Fewer splats or smaller images take less"
+            savable = self._saved_step == self._completed_step
             raise TrainingStopped(f"{message} (docs/troubleshooting.md).", self.step, "memory", savable) from None
 
     def _save_last_step(self) -> str:
@@ -338,7 +339,7 @@ class NrfgsTrainer(Trainer):
         self._is_ending = True
         last = next(iter(checkpoint_files.find(self.checkpoint_dir).values()), None)
         kept = f"The last checkpoint is {last}." if last else "This training has written no checkpoint."
-        if self._made < self._start_step:
+        if self._completed_step < self._start_step:
             return f"No step had been made. {kept}"
         self.optimizers.zero_grad_all()
         gc.collect()
@@ -347,11 +348,11 @@ class NrfgsTrainer(Trainer):
         if not rows_agree(model.gauss_params, self.optimizers.optimizers, model.densification.state.values()):
             return f"Splats were being added or removed, so that nothing could be saved. {kept}"
         try:
-            return f"Step {self._made} is saved. {self._save_once()}."
+            return f"Step {self._completed_step} is saved. {self._save_once()}."
         except (Exception, ForTheUser) as error:  # the first failure is the one to raise
             return f"The state could not be saved ({error}). {kept}"
 
-    def take_the_mean(self, stopped: bool = False) -> None:
+    def install_mean(self, stopped: bool = False) -> None:
         """Replace the parameters by their mean over the last steps, unless the training was stopped before them, and
         say so; TrainingStopped where the last step met a number that is not finite."""
         if self.mean is None:

@@ -10,7 +10,7 @@ from torch.testing import assert_close
 
 from nrfgs_ns.densification import CHANGE, ErrorGuided
 from nrfgs_ns.densification.error_guided import DECAY, ERROR, SHARE, WIDTH, draw, split
-from nrfgs_ns.densification.strategy import HELD
+from nrfgs_ns.densification.strategy import GROWTH_LIMIT
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.rasterizer import composite, project
 
@@ -45,7 +45,7 @@ def errors(size: int, scale: float = 1.0, views: int = 2, cameras_at_once: bool 
         image, _, info = composite(projection, colors[rows], opacities[rows], absgrad=True)
         strategy.pre_backward(0, info, opacities[rows], logits)
         (image - truth).abs().mean().backward()
-        strategy._take_statistics(0, info, 12)
+        strategy._update_statistics(0, info, 12)
     assert strategy.state[ERROR].min() > 0
     return strategy.state[ERROR]
 
@@ -58,7 +58,7 @@ def test_the_error_is_the_largest_of_a_view_whatever_the_unit_and_the_size_and_n
 
 
 def test_many_different_views_raise_the_threshold():
-    thresholds = [ErrorGuided(threshold=0.001).build(999, views, 1.0).raised for views in (1, 30, 300, 600)]
+    thresholds = [ErrorGuided(threshold=0.001).build(999, views, 1.0).threshold for views in (1, 30, 300, 600)]
     assert thresholds == pytest.approx([0.001, 0.00101, 0.002, 0.005], rel=1e-3)
 
 
@@ -72,7 +72,7 @@ def test_rows_that_no_camera_sees_change_nothing():
         info["means2d"].absgrad = torch.full((len(rows), 2), 0.3)
         info |= {"gaussian_ids": rows, "radii": torch.where(seen, 20, 0)}
         strategy.pre_backward(0, info, torch.full((len(rows),), 0.7), table.splats["opacities"])
-        strategy._take_statistics(0, info, 6)
+        strategy._update_statistics(0, info, 6)
     for name in (ERROR, WIDTH, CHANGE):
         assert_close(whole.state[name], visible.state[name], rtol=0, atol=0)
 
@@ -130,7 +130,7 @@ def test_a_share_of_the_candidates_is_split_and_the_dead_are_replaced():
     assert len(table) == 40 + round(SHARE * 20) - 4
     assert set(table.splats["latents"][:4, 0].long().tolist()) <= set(range(4, 40))
     assert strategy.moved_at == 600, "rows denote other splats, and a mean over steps must know"
-    assert all(len(value) == len(table) for name, value in strategy.state.items() if name != HELD)
+    assert all(len(value) == len(table) for name, value in strategy.state.items() if name != GROWTH_LIMIT)
 
 
 def test_the_shown_opacity_decides_what_is_dead():

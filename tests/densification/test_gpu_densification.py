@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 from nrfgs_ns.densification import statistics
 from nrfgs_ns.densification.relocation import add_noise, split_evenly
-from nrfgs_ns.densification.statistics import Step, Tables
+from nrfgs_ns.densification.statistics import Statistics, Step
 
 pytestmark = pytest.mark.gpu
 
@@ -62,11 +62,11 @@ def test_one_camera_is_the_kernels(monkeypatch, sums):
     rows = torch.randperm(5000, device="cuda")[:3000]
     radii = torch.randint(0, 90, (3000,), dtype=torch.int32, device="cuda")
     info = {"width": 640, "height": 480, "n_cameras": 1, "gaussian_ids": rows, "radii": radii}
-    tables = Tables(*(torch.full((5000,), start, device="cuda") for start in (0.0, 0.0, -2.0)))
+    tables = Statistics(*(torch.full((5000,), start, device="cuda") for start in (0.0, 0.0, -2.0)))
     shown = torch.randn(3000, 2, device="cuda"), None if sums else torch.rand(3000, device="cuda") - 0.5, sums
-    twin = Tables(*(value.clone() for value in tables))
+    twin = Statistics(*(value.clone() for value in tables))
     statistics.in_torch(twin, Step(rows, radii, 640.0, (640.0, 480.0)), *shown)
     monkeypatch.setattr(statistics, "in_torch", None)
-    statistics.remember(tables, info, 1.0, *shown)
+    statistics.accumulate(tables, info, 1.0, *shown)
     for value, other in zip(tables, twin, strict=True):
         torch.testing.assert_close(value, other, rtol=1e-6, atol=0.0)

@@ -9,7 +9,7 @@ from densification_cases import REFINES, Table, arguments, strategy
 from short_trainings import set_up
 
 from nrfgs_ns.densification import STRATEGIES, memory
-from nrfgs_ns.densification.strategy import HELD
+from nrfgs_ns.densification.strategy import GROWTH_LIMIT
 
 GB = 10**9
 OPTIONS = {"error-guided": {"threshold": 1e-4}}
@@ -86,11 +86,11 @@ def test_a_far_estimate_bounds_a_refinement_alone(monkeypatch, capsys):
     """Of several devices the one with the most splats says whether the limit is near."""
     table, rules = Table(40), strategy("error-guided")
     monkeypatch.setattr(memory, "most_splats", lambda *_: 50)
-    assert rules.fitting(REFINES, table.info(), table.splats, table.optimizers, 30) == 10
-    assert rules.state[HELD] is None and not capsys.readouterr().out
-    monkeypatch.setattr(rules, "least", lambda number: number - 8 if number < 0 else number)  # another has 48
-    assert rules.fitting(REFINES, table.info(), table.splats, table.optimizers, 30) == 10
-    assert rules.state[HELD] == (50, 0)
+    assert rules.room_for(REFINES, table.info(), table.splats, table.optimizers, 30) == 10
+    assert rules.state[GROWTH_LIMIT] is None and not capsys.readouterr().out
+    monkeypatch.setattr(rules, "minimum_of_devices", lambda n: n - 8 if n < 0 else n)  # another has 48
+    assert rules.room_for(REFINES, table.info(), table.splats, table.optimizers, 30) == 10
+    assert rules.state[GROWTH_LIMIT] == (50, 0)
 
 
 @pytest.mark.parametrize("name", ["error-guided", "mcmc"])
@@ -139,7 +139,7 @@ def test_growth_is_held_in_a_small_share_of_a_card(name, tiny_scene, tmp_path, c
     torch.cuda.set_per_process_memory_fraction((torch.cuda.memory_reserved() + 300e6) / total)
     try:
         trainer.train()
-        held, within = trainer.pipeline.model.densification.state[HELD]
+        held, within = trainer.pipeline.model.densification.state[GROWTH_LIMIT]
         assert within < total and held > 10_000
     finally:
         torch.cuda.set_per_process_memory_fraction(1.0)

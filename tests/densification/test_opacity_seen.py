@@ -12,7 +12,7 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.densification import CHANGE, UNSEEN
-from nrfgs_ns.densification.strategy import change_of, seen_with
+from nrfgs_ns.densification.strategy import change_of, shown_opacity
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -99,8 +99,8 @@ def test_what_is_seen_is_what_was_shown():
     change = change_of(stored, shown)
     assert change.abs().max() <= 1 and change[-1] == 0
     for nothing in (0 * stored, torch.full_like(stored, UNSEEN)):  # a head of stored opacity, and no view
-        assert torch.equal(seen_with(stored, nothing), stored)
-    assert_close(seen_with(stored, change), shown, rtol=0, atol=2e-7)
+        assert torch.equal(shown_opacity(stored, nothing), stored)
+    assert_close(shown_opacity(stored, change), shown, rtol=0, atol=2e-7)
 
 
 def test_what_is_seen_follows_the_stored_opacity():

@@ -6,7 +6,7 @@ from densification_cases import arguments
 from short_trainings import assert_same_training, checkpoint_of, models_of, set_up, trained
 
 from nrfgs_ns.densification import CHANGE, UNSEEN, memory
-from nrfgs_ns.densification.strategy import HELD
+from nrfgs_ns.densification.strategy import GROWTH_LIMIT
 from nrfgs_ns.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
@@ -75,7 +75,7 @@ def test_growth_that_memory_holds_is_held_in_a_continued_training(densification,
     rest, measured = run("rest", densification, 26, half), iter([310])
     assert_same_training(run("whole", densification, 26), rest, rtol=0, atol=0)
     assert 300 <= len(rest["pipeline"]["_model.gauss_params.means"]) <= 310
-    assert rest["pipeline"]["_model._extra_state"]["strategy"][HELD] == (310, 0)
+    assert rest["pipeline"]["_model._extra_state"]["strategy"][GROWTH_LIMIT] == (310, 0)
 
 
 def test_another_strategies_checkpoint_is_refused(run):

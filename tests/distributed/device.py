@@ -129,7 +129,7 @@ def statistics(model, info) -> dict:
     rules = model.densification
     rules.take_changes(info, model.num_points)
     if isinstance(rules, GradientDensification):
-        rules._take_statistics(info, model.num_points)
+        rules._update_statistics(info, model.num_points)
     return {key: value.clone() for key, value in rules.state.items() if isinstance(value, torch.Tensor)}
 
 

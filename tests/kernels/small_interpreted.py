@@ -13,8 +13,8 @@ from test_against_twin import scenes
 from tile_list_cases import Splats, assert_lists, splats
 from torch.testing import assert_close
 
-from nrfgs_ns.densification.statistics import Step, Tables, in_torch
-from nrfgs_ns.densification.statistics_triton import take
+from nrfgs_ns.densification.statistics import Statistics, Step, in_torch
+from nrfgs_ns.densification.statistics_triton import in_triton
 from nrfgs_ns.image import ssim_triton
 from nrfgs_ns.image.ssim import photometric_loss
 from nrfgs_ns.rasterizer import TILE_SIZE, gsplat_cuda
@@ -54,10 +54,10 @@ def test_the_kernel_remembers_what_its_twin_remembers(wanted, sums, visible):
     gradients, change = torch.randn(visible, 2), torch.rand(visible) - 0.5
     gradients[::7, 0], gradients[1::7, 1], change[2::7] = torch.nan, torch.inf, torch.nan
     tables = torch.rand(400) / 50, torch.rand(400) * 300, torch.rand(400) - 1.0
-    mine = Tables(*(table if want else None for table, want in zip(tables, wanted, strict=True)))
-    theirs = Tables(*(None if value is None else value.clone() for value in mine))
+    mine = Statistics(*(table if want else None for table, want in zip(tables, wanted, strict=True)))
+    theirs = Statistics(*(None if value is None else value.clone() for value in mine))
     shown = Step(rows, radii, 400.0, (400.0, 300.0)), gradients, None if sums else change, sums
-    take(mine, *shown)
+    in_triton(mine, *shown)
     in_torch(theirs, *shown)
     for value, twin in zip(mine, theirs, strict=True):
         if twin is not None:

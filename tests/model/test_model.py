@@ -110,7 +110,7 @@ def test_a_fixed_camera_is_what_a_camera_is(batched):
     pose = torch.cat([torch.linalg.qr(torch.randn(3, 3))[0], 100 * torch.randn(3, 1)], dim=1)
     cameras = Cameras(pose[None], fx=100.5, fy=90.25, cx=50.0, cy=31.0, width=101, height=63)
     camera = cameras[0:1] if batched else cameras[0]
-    expected, got = pinhole(camera, pose[None], 1), Pinholes().fixed(camera, torch.device("cpu"))
+    expected, got = pinhole(camera, pose[None], 1), Pinholes().of_full_size(camera, torch.device("cpu"))
     assert (got.width, got.height) == (101, 63)
     for name in ("viewmat", "K", "center"):
         assert torch.equal(getattr(got, name), getattr(expected, name)) and getattr(got, name).data_ptr() % 16 == 0
@@ -120,10 +120,10 @@ def test_a_fixed_camera_is_what_a_camera_is(batched):
 def test_a_camera_on_the_gpu_is_asked_once_until_it_is_written_to():
     pinholes, gpu = Pinholes(), torch.device("cuda")
     camera = Cameras(torch.eye(4)[None, :3], fx=100.0, fy=90.0, cx=50.0, cy=31.0, width=101, height=63)[0:1].to("cuda")
-    first = pinholes.fixed(camera, gpu)
-    assert pinholes.fixed(camera, gpu) is first
+    first = pinholes.of_full_size(camera, gpu)
+    assert pinholes.of_full_size(camera, gpu) is first
     camera.camera_to_worlds[0, 0, 3] = 7.0
-    assert pinholes.fixed(camera, gpu).center.tolist() == [7.0, 0.0, 0.0]
+    assert pinholes.of_full_size(camera, gpu).center.tolist() == [7.0, 0.0, 0.0]
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5])

@@ -14,7 +14,7 @@ from tile_list_cases import Splats, assert_lists, splats
 
 from nrfgs_ns.rasterizer import TILE_SIZE, ProjectionOptions, composite, project
 from nrfgs_ns.rasterizer.torch_cpu import compositing
-from nrfgs_ns.rasterizer.torch_cpu.tiles import SUB_TILE, footprints, list_tiles
+from nrfgs_ns.rasterizer.torch_cpu.tiles import SUB_TILE, find_footprints, list_tiles
 
 
 def test_info_has_gsplats_keys():
@@ -153,7 +153,7 @@ def test_lists_are_complete_ordered_and_tight(name):
     with torch.no_grad():
         seen = project(case.means, case.quats, case.scales, case.viewmats, case.Ks, case.width, case.height)
     of = Splats(seen.means2d, seen.radii, seen.depths, seen.conics, case.opacities[seen.gaussian_ids])
-    prints = footprints(seen, of.opacities)
+    prints = find_footprints(seen, of.opacities)
     lists = list_tiles(prints, prints.whole)
     counts = torch.zeros(seen.n_cameras * prints.tiles_y * prints.tiles_x, dtype=torch.int64)
     counts[lists.tiles] = lists.count

@@ -106,7 +106,7 @@ def test_what_is_not_recorded_is_said_once(build, words, step, capsys, monkeypat
     pipeline, graphs = build("cpu", *words.split())
     batch, pipeline.model.step = pipeline.datamanager.train_view(0)[1], step
     monkeypatch.setattr(type(pipeline.model), "device", torch.device("cuda"))
-    assert not any(graphs._takes(batch) for _ in range(2))
+    assert not any(graphs._can_record(batch) for _ in range(2))
     assert capsys.readouterr().out.count("not recorded") == 1
 
 
@@ -114,14 +114,14 @@ def test_graphs_of_replaced_splats_are_freed_while_steps_are_not_recorded(build,
     pipeline, graphs = build("cpu", "nrfgs", "--pipeline.model.robust-loss", "0.1")
     model, batch = pipeline.model, pipeline.datamanager.train_view(0)[1]
     monkeypatch.setattr(type(model), "device", torch.device("cuda"))
-    graphs._is_new()
+    graphs._drop_if_outdated()
     graphs._graphs = {None: SimpleNamespace(most_pairs=lambda: 2, count=1)}
     model.step = 499
-    assert graphs._takes(batch) and graphs._graphs
+    assert graphs._can_record(batch) and graphs._graphs
     model.step = 500
     for name, value in model.gauss_params.items():
         model.gauss_params[name] = torch.nn.Parameter(value.detach().clone())
-    assert not graphs._takes(batch) and not graphs._graphs
+    assert not graphs._can_record(batch) and not graphs._graphs
 
 
 RECORDED = [*(f"densification {name},opacity_seen={seen}" for name in STRATEGIES for seen in ("base", "peak"))]
@@ -136,7 +136,7 @@ def test_every_strategy_is_recorded(build, option, monkeypatch):
     batch = pipeline.datamanager.train_view(0)[1]
     monkeypatch.setattr(type(pipeline.model), "device", torch.device("cuda"))
     for pipeline.model.step in (0, 499, 2000, 20_000):
-        assert graphs._takes(batch)
+        assert graphs._can_record(batch)
 
 
 @pytest.mark.gpu
@@ -267,7 +267,7 @@ def test_a_training_learns_the_same(tiny_scene, tmp_path, monkeypatch):
     for taken in (True, False):
         with monkeypatch.context() as only:
             if not taken:
-                only.setattr(StepGraphs, "_takes", lambda *_: False)
+                only.setattr(StepGraphs, "_can_record", lambda *_: False)
             args = command_line("nrfgs", tiny_scene, tmp_path / str(taken), 600, {"--schedule-steps": 30000})
             failures = []
             only.setattr(step_graph, "warn", failures.append)

@@ -23,8 +23,6 @@ import triton.language as tl
 from nrfgs_ns.appearance.fused.tiles import (
     deal,
     dot,
-    give,
-    give_latents,
     last,
     load_four,
     load_latents,
@@ -33,14 +31,16 @@ from nrfgs_ns.appearance.fused.tiles import (
     sigmoid,
     sin_half_turns,
     stack,
+    store_gradients,
+    store_latents,
     tanh,
     unstack,
 )  # fmt: skip
 
-OUTPUTS = tl.constexpr(8)  # columns of W2
+OUTPUTS = tl.constexpr(8)  # packing.OUTPUT_COLUMNS
 PI = tl.constexpr(3.141592653589793)
 HALF_LOG_2 = tl.constexpr(0.34657359027997264)
-FARTHEST = tl.constexpr(1e18)  # encoding.FARTHEST; the slope beyond, 0 there, is below 1e-18 here
+FARTHEST = tl.constexpr(1e18)  # nrf.FARTHEST; beyond it the twin's slope is 0, this one's below 1e-18
 LOGIT_SLOPE = tl.constexpr(4.0)  # nrf.LOGIT_SLOPE
 
 
@@ -49,7 +49,7 @@ LOGIT_SLOPE = tl.constexpr(4.0)  # nrf.LOGIT_SLOPE
 
 @triton.jit
 def _view(means, centers, rows, items, lanes, eps_squared, log_unit, B: tl.constexpr, ONE_CENTER: tl.constexpr):
-    """encoding.view_geometry: direction (lane 3 is 0); log r in scene units, 1 / r and |v| above the floor, [B, 1]."""
+    """nrf.view_geometry: direction (lane 3 is 0); log r in scene units, 1 / r and whether |v| >= eps, [B, 1]."""
     if ONE_CENTER:
         center = tl.load(centers + lanes, mask=lanes < 3, other=0.0)
     else:
@@ -58,8 +58,8 @@ def _view(means, centers, rows, items, lanes, eps_squared, log_unit, B: tl.const
     v = tl.minimum(tl.maximum(v, -FARTHEST, tl.PropagateNan.ALL), FARTHEST, tl.PropagateNan.ALL)
     square = tl.sum(v * v, axis=1)[:, None]
     floored = tl.maximum(square, eps_squared, propagate_nan=tl.PropagateNan.ALL)
-    inverse = tl.rsqrt(floored)
-    return v * inverse, HALF_LOG_2 * tl.log2(floored) - log_unit, inverse, square >= eps_squared
+    inv_r = tl.rsqrt(floored)
+    return v * inv_r, HALF_LOG_2 * tl.log2(floored) - log_unit, inv_r, square >= eps_squared
 
 
 # Features.
@@ -67,7 +67,7 @@ def _view(means, centers, rows, items, lanes, eps_squared, log_unit, B: tl.const
 
 @triton.jit
 def _waves(d, BANDS: tl.constexpr):
-    """encoding.fourier_bands: tiles (sin(pi d), cos(pi d), sin(2 pi d), cos(2 pi d), ..), two for each band.
+    """nrf.fourier_bands: tiles (sin(pi d), cos(pi d), sin(2 pi d), cos(2 pi d), ..), two for each band.
 
     Band 0 within 2e-7: half turns make the reduction to [-1/2, 1/2] exact. Every other band by double angles,
 
@@ -103,11 +103,12 @@ def _features_backward(d_F, waves, lanes, B: tl.constexpr, R: tl.constexpr, BAND
     stacked = tl.permute(tl.reshape(d_F, (B, R, 4)), (0, 2, 1))
     twos: tl.constexpr = 4 if R == 16 else 3 if R == 8 else 2
     tiles = unstack(tl.reshape(stacked, (B, 4) + (2,) * twos), R)
-    # sin' = cos and cos' = -sin, by the chain rule times 2^k pi: from the highest band down, doubling.
-    turn = waves[2 * BANDS - 1] * tiles[2 * BANDS - 1] - waves[2 * BANDS - 2] * tiles[2 * BANDS]
+    # Band k adds 2^k pi (cos g_sin - sin g_cos) to the direction's gradient. Summed from the highest band down, the
+    # factor 2^k comes from doubling the sum at each step.
+    slope_sum = waves[2 * BANDS - 1] * tiles[2 * BANDS - 1] - waves[2 * BANDS - 2] * tiles[2 * BANDS]
     for k in tl.static_range(BANDS - 2, -1, -1):
-        turn = 2.0 * turn + (waves[2 * k + 1] * tiles[2 * k + 1] - waves[2 * k] * tiles[2 * k + 2])
-    return tl.where(lanes == 3, tiles[1], tiles[0] + PI * turn), tiles[R - 1]
+        slope_sum = 2.0 * slope_sum + (waves[2 * k + 1] * tiles[2 * k + 1] - waves[2 * k] * tiles[2 * k + 2])
+    return tl.where(lanes == 3, tiles[1], tiles[0] + PI * slope_sum), tiles[R - 1]
 
 
 # Outputs.
@@ -115,7 +116,7 @@ def _features_backward(d_F, waves, lanes, B: tl.constexpr, R: tl.constexpr, BAND
 
 @triton.jit
 def _bounded_opacity(logit, alpha, t, scale, BOUND: tl.constexpr):
-    """Opacity, with its slopes by the logit and by t = tanh(d_alpha). See nrf.py."""
+    """Opacity, and its derivatives by the logit and by t = tanh(d_alpha). See nrf.py."""
     alpha_slope = alpha * (1.0 - alpha)
     if BOUND == "none":  # no residual: nothing to bound
         return alpha, alpha_slope, 0.0 * t
@@ -131,7 +132,7 @@ def _bounded_opacity(logit, alpha, t, scale, BOUND: tl.constexpr):
 
 @triton.jit
 def _outputs(Y, lanes, B: tl.constexpr, COLUMNS: tl.constexpr):
-    """High branch's outputs [B, 4], the open gate sigmoid(w) [B, 1], and tanh's argument [B, 4]."""
+    """(dc_high, w) [B, 4], the gate sigmoid(w) [B, 1], and tanh's argument [B, 4]: dc in lanes 0..2, d_alpha in 3."""
     if COLUMNS == 16:
         Y, _ = tl.split(tl.permute(tl.reshape(Y, (B, 2, 8)), (0, 2, 1)))
     low, high = tl.split(tl.reshape(Y, (B, 4, 2)))
@@ -152,7 +153,7 @@ def _inputs(Z, F, B: tl.constexpr, P: tl.constexpr, KIND: tl.constexpr):
 
 
 @triton.jit
-def base_of(stored, lanes, sh_c0):
+def base_appearance(stored, lanes, sh_c0):
     """(c, alpha) from features_dc, and the logit in lane 3."""
     return tl.where(lanes < 3, 0.5 + sh_c0 * stored, sigmoid(stored))
 
@@ -170,12 +171,12 @@ def forward_kernel(
     outputs = tl.arange(0, COLUMNS)
     units = tl.arange(0, H)
     inputs = tl.arange(0, 2 * P)
-    second = packed + 2 * P * H
+    layer2 = packed + 2 * P * H
     real = outputs < OUTPUTS
     W1 = operand(tl.load(packed + inputs[:, None] * H + units[None, :]), KIND)
-    W2 = tl.load(second + units[:, None] * OUTPUTS + outputs[None, :], mask=real[None, :], other=0.0)
+    W2 = tl.load(layer2 + units[:, None] * OUTPUTS + outputs[None, :], mask=real[None, :], other=0.0)
     W2 = operand(W2, KIND)
-    b2 = tl.load(second + H * OUTPUTS + outputs, mask=real, other=0.0)
+    b2 = tl.load(layer2 + H * OUTPUTS + outputs, mask=real, other=0.0)
 
     # Values hoisted out of the loop would take registers that its inside needs.
     for block in tl.range(tl.program_id(0), tl.cdiv(count, B), tl.num_programs(0), disable_licm=True):
@@ -187,13 +188,13 @@ def forward_kernel(
         d, log_r, _, _ = _view(means, centers, rows, items, lanes, eps_squared, log_unit, B, ONE_CENTER)
         stored = load_four(features_dc, opacities, rows, rows >= 0, lanes, B)
 
-        base = base_of(stored, lanes, sh_c0)
+        base = base_appearance(stored, lanes, sh_c0)
         F = _features(d, base, log_r, _waves(d, BANDS), lanes, B, P // 4, BANDS)
         pre = dot(_inputs(Z, F, B, P, KIND), W1, tl.zeros((B, H), tl.float32), KIND)
         hidden = operand(tl.maximum(pre, 0.0, propagate_nan=tl.PropagateNan.ALL), KIND)
         Y = dot(hidden, W2, tl.zeros((B, COLUMNS), tl.float32), KIND) + b2[None, :]
-        _, _, seen = _outputs(Y, lanes, B, COLUMNS)
-        t = tanh(seen)
+        _, _, argument = _outputs(Y, lanes, B, COLUMNS)
+        t = tanh(argument)
 
         color = tl.maximum(base + color_scale * t, 0.0, propagate_nan=tl.PropagateNan.ALL)
         opacity, _, _ = _bounded_opacity(stored, base, t, opacity_scale, BOUND)
@@ -223,16 +224,16 @@ def backward_kernel(
     sixteen = tl.arange(0, 16)
     units = tl.arange(0, H)
     inputs = tl.arange(0, 2 * P)
-    second = packed + 2 * P * H
+    layer2 = packed + 2 * P * H
     real = outputs < OUTPUTS
     weights1 = tl.load(packed + inputs[:, None] * H + units[None, :])
     W1 = operand(weights1, KIND)
     W1_T = tl.trans(operand(weights1, GRADIENT_KIND))
-    W2 = tl.load(second + units[:, None] * OUTPUTS + outputs[None, :], mask=real[None, :], other=0.0)
+    W2 = tl.load(layer2 + units[:, None] * OUTPUTS + outputs[None, :], mask=real[None, :], other=0.0)
     W2 = operand(W2, KIND)
-    W2_T = tl.load(second + units[:, None] * OUTPUTS + sixteen[None, :], mask=sixteen[None, :] < OUTPUTS, other=0.0)
+    W2_T = tl.load(layer2 + units[:, None] * OUTPUTS + sixteen[None, :], mask=sixteen[None, :] < OUTPUTS, other=0.0)
     W2_T = tl.trans(operand(W2_T, GRADIENT_KIND))
-    b2 = tl.load(second + H * OUTPUTS + outputs, mask=real, other=0.0)
+    b2 = tl.load(layer2 + H * OUTPUTS + outputs, mask=real, other=0.0)
     if COLUMNS == 8:
         d_W1 = tl.zeros((H, 2 * P), tl.float32)
     else:
@@ -247,12 +248,12 @@ def backward_kernel(
         items = tl.minimum(items, count - 1).to(tl.int64)  # the last block repeats the last splat, and keeps it back
         rows = tl.load(visible + items)
         Z = load_latents(latents, rows, D, P, B)
-        d, log_r, inverse, above = _view(means, centers, rows, items, lanes, eps_squared, log_unit, B, ONE_CENTER)
+        d, log_r, inv_r, above_floor = _view(means, centers, rows, items, lanes, eps_squared, log_unit, B, ONE_CENTER)
         stored = load_four(features_dc, opacities, rows, rows >= 0, lanes, B)
         d_out = load_four(d_colors, d_opacities, items, valid, lanes, B)
 
         # Forward again.
-        base = base_of(stored, lanes, sh_c0)
+        base = base_appearance(stored, lanes, sh_c0)
         waves = _waves(d, BANDS)
         F = _features(d, base, log_r, waves, lanes, B, P // 4, BANDS)
         X = _inputs(Z, F, B, P, KIND)
@@ -262,8 +263,8 @@ def backward_kernel(
         if KIND != GRADIENT_KIND:
             X = _inputs(Z, F, B, P, GRADIENT_KIND)
             hidden = operand(pre, GRADIENT_KIND)
-        high, gate, seen = _outputs(Y, lanes, B, COLUMNS)
-        t = tanh(seen)
+        high, gate, argument = _outputs(Y, lanes, B, COLUMNS)
+        t = tanh(argument)
 
         # Outputs.
         d_color = tl.where(base + color_scale * t >= 0.0, d_out, 0.0)
@@ -287,33 +288,33 @@ def backward_kernel(
         else:
             d_W1 = dot(tl.trans(X), d_pre, d_W1, GRADIENT_KIND)
         d_Z, d_F = tl.split(tl.reshape(d_X, (B, P, 2)))
-        give_latents(d_latents, rows, d_Z, valid, D, P, B, ONE_CENTER)
+        store_latents(d_latents, rows, d_Z, valid, D, P, B, ONE_CENTER)
 
         # Features.
         d_view, d_base = _features_backward(d_F, waves, lanes, B, P // 4, BANDS)
         d_stored = tl.where(lanes < 3, sh_c0 * (d_base + d_color), d_out * logit_slope + d_base * base * (1.0 - base))
         d_stored = deal(d_stored, B)
-        give(d_features_dc + rows * 3 + lanes, d_stored, valid & (lanes < 3), ONE_CENTER)
-        give(d_logits + rows + (lanes - 3), d_stored, valid & (lanes == 3), ONE_CENTER)
+        store_gradients(d_features_dc + rows * 3 + lanes, d_stored, valid & (lanes < 3), ONE_CENTER)
+        store_gradients(d_logits + rows + (lanes - 3), d_stored, valid & (lanes == 3), ONE_CENTER)
 
         # Geometry: d = v / r and log r, where r is floored and has no slope below the floor.
         radial = tl.sum(tl.where(lanes < 3, -d_view * d, d_view), axis=1)[:, None]
-        radial = tl.where(above, radial, 0.0)
-        d_v = inverse * (d_view + radial * d)
+        radial = tl.where(above_floor, radial, 0.0)
+        d_v = inv_r * (d_view + radial * d)
         mask = valid & (lanes < 3)
-        give(d_means + rows * 3 + lanes, deal(-d_v, B), mask, ONE_CENTER)
+        store_gradients(d_means + rows * 3 + lanes, deal(-d_v, B), mask, ONE_CENTER)
         if CENTER and ONE_CENTER:
             d_center += d_v  # 0 beyond `count`, where d_out is
         if CENTER and not ONE_CENTER:
             tl.store(d_centers + items * 3 + lanes, deal(d_v, B), mask=mask)
 
-    mine = partials + tl.program_id(0) * SLOTS
-    second = mine + 2 * P * H
+    partial = partials + tl.program_id(0) * SLOTS
+    layer2 = partial + 2 * P * H
     if COLUMNS == 8:
-        tl.store(mine + inputs[None, :] * H + units[:, None], d_W1)
+        tl.store(partial + inputs[None, :] * H + units[:, None], d_W1)
     else:
-        tl.store(mine + inputs[:, None] * H + units[None, :], d_W1)
-    tl.store(second + units[:, None] * OUTPUTS + outputs[None, :], d_W2, mask=real[None, :])
+        tl.store(partial + inputs[:, None] * H + units[None, :], d_W1)
+    tl.store(layer2 + units[:, None] * OUTPUTS + outputs[None, :], d_W2, mask=real[None, :])
     d_b2 = tl.sum(tl.reshape(tl.join(d_b2_low, d_b2_high), (B, 8)), axis=0)
-    tl.store(second + H * OUTPUTS + tl.arange(0, 8), d_b2)
-    tl.store(second + H * OUTPUTS + OUTPUTS + tl.arange(0, 4), tl.sum(d_center, axis=0))
+    tl.store(layer2 + H * OUTPUTS + tl.arange(0, 8), d_b2)
+    tl.store(layer2 + H * OUTPUTS + OUTPUTS + tl.arange(0, 4), tl.sum(d_center, axis=0))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The kernels as one differentiable function of tables, camera centres and shared weights.
+"""Both kernels as one differentiable function of tables, camera centres and shared weights.
 
-A training step of a small scene is bound by the host, hence few launches: two to pack the weights, one forward, one to
+A training step of a small scene is bound by the host, so launches are few: two to pack the weights, one forward, one to
 zero the tables' gradients unless every splat is visible, one backward, two to sum and unpack the weights' gradients.
 """
 
@@ -108,8 +108,8 @@ class FieldOptions(NamedTuple):
     @staticmethod
     def of(config, scene_unit: float = 1.0) -> "FieldOptions":
         """Options of an NrfConfig."""
-        eps_squared, log_unit = (config.distance_eps * scene_unit) ** 2, math.log(scene_unit)
-        scalars = eps_squared, log_unit, config.color_scale, config.opacity_scale, SH_C0
+        eps_squared = (config.distance_eps * scene_unit) ** 2
+        scalars = eps_squared, math.log(scene_unit), config.color_scale, config.opacity_scale, SH_C0
         return FieldOptions(scalars, config.bound if config.opacity_residual else "none", config.precision)
 
 
@@ -123,37 +123,38 @@ class FusedFunction(torch.autograd.Function):
     def forward(ctx, packing: Packing, launches: Launches, options: FieldOptions, means, latents, features_dc,
                 opacities, visible, centers, *weights):  # fmt: skip
         tables = [_contiguous(table) for table in (means, latents, features_dc, opacities)]
-        visible, centers, packed = _contiguous(visible), _contiguous(centers), _packed(packing, weights)
-        how = launches.forward
+        visible, centers = _contiguous(visible), _contiguous(centers)
+        packed = _packed(packing, weights)
+        launch = launches.forward
         count = len(visible)
-        colors, seen = packed.new_empty(count, 3), packed.new_empty(count)
+        outputs = packed.new_empty(count, 3), packed.new_empty(count)
         if count > 0:
             launch_forward(
-                (_programs(how, count, visible.device), 1, 1), *tables, visible, centers, packed, colors, seen,
-                count, *options.scalars, **_constants(packing, how, options, centers.dim() == 1),
+                (_programs(launch, count, visible.device), 1, 1), *tables, visible, centers, packed, *outputs,
+                count, *options.scalars, **_constants(packing, launch, options, centers.dim() == 1),
             )  # fmt: skip
         ctx.save_for_backward(*tables, visible, centers, packed)
-        ctx.packing, ctx.how, ctx.options = packing, launches.backward, options
-        return colors, seen
+        ctx.packing, ctx.launch, ctx.options = packing, launches.backward, options
+        return outputs
 
     @staticmethod
     @once_differentiable
     def backward(ctx, d_colors, d_opacities):
-        packing, how, options = ctx.packing, ctx.how, ctx.options
+        packing, launch, options = ctx.packing, ctx.launch, ctx.options
         *tables, visible, centers, packed = ctx.saved_tensors
         count, rows, device = len(visible), len(tables[0]), visible.device
-        one_center, wants_center = centers.dim() == 1, ctx.needs_input_grad[8]
+        one_center, wants_center = centers.dim() == 1, ctx.needs_input_grad[8]  # of forward's `centers`
         # Without zeros only where the kernel writes each row, once.
         d_tables = _tables(rows, packing.latent_dim, device, zero=not one_center or count < rows)
         d_centers = torch.empty_like(centers) if wants_center else tables[0].new_empty(CENTER_SLOTS)
         if count > 0:
-            programs = _programs(how, count, device)
+            programs = _programs(launch, count, device)
             partials = tables[0].new_empty(programs, len(packing.gather) + CENTER_SLOTS)
             launch_backward(
                 (programs, 1, 1), *tables, visible, centers, packed,
                 _contiguous(d_colors), _contiguous(d_opacities), *d_tables, d_centers, partials,
                 count, *options.scalars, SLOTS=partials.shape[1], CENTER=wants_center,
-                GRADIENT_KIND=KINDS[options.precision][1], **_constants(packing, how, options, one_center),
+                GRADIENT_KIND=KINDS[options.precision][1], **_constants(packing, launch, options, one_center),
             )  # fmt: skip
             sums = partials.sum(dim=0)
         else:
@@ -171,19 +172,19 @@ def _packed(packing: Packing, weights: Sequence[Tensor]) -> Tensor:
     return torch.cat([*flat, _zero(flat[0].device)]).index_select(0, packing.gather)
 
 
-def _constants(packing: Packing, how: Launch, options: FieldOptions, one_center: bool) -> dict[str, Any]:
+def _constants(packing: Packing, launch: Launch, options: FieldOptions, one_center: bool) -> dict[str, Any]:
     """Constants of both kernels, and options of Triton's compiler."""
     return {
         "D": packing.latent_dim,
         "P": packing.width,
         "H": packing.hidden,
         "BANDS": packing.num_bands,
-        "B": how.block,
-        "COLUMNS": how.columns,
+        "B": launch.block,
+        "COLUMNS": launch.columns,
         "ONE_CENTER": one_center,
         "BOUND": options.bound,
         "KIND": KINDS[options.precision][0],
-        **how.options(packing.hidden),
+        **launch.options(packing.hidden),
     }
 
 
@@ -214,10 +215,10 @@ def probe(packing: Packing, launches: Launches, options: FieldOptions) -> None:
     sum(output.sum() for output in outputs).backward()
 
 
-def _programs(how: Launch, count: int, device: torch.device) -> int:
+def _programs(launch: Launch, count: int, device: torch.device) -> int:
     """Programs to launch: all that run at once, unless there are fewer blocks."""
-    at_once = INTERPRETER_PROGRAMS if INTERPRETED.value else how.programs_per_sm * _multiprocessors(device)
-    return min(at_once, math.ceil(count / how.block))
+    at_once = INTERPRETER_PROGRAMS if INTERPRETED.value else launch.programs_per_sm * _multiprocessors(device)
+    return min(at_once, math.ceil(count / launch.block))
 
 
 def _tables(rows: int, latent_dim: int, device: torch.device, zero: bool) -> list[Tensor]:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Building blocks of the fused kernels: functions and products on tensor cores, and access to tables.
 
-Every number is read by the thread in which tensor cores need it. The compiler deals the rows of a load to the threads,
-four for each row: eight rows to each warp, then eight more. Tensor cores need sixteen neighbours in a warp. The order
-of splats in a matrix is free, so rows are renumbered at no cost. A thread reads four numbers of a row at once, so
-latents come in sixteens. D, P, R and B: packing.py and kernels.py.
+Every number is read by the thread in which tensor cores need it, so that nothing moves between threads. The compiler
+gives four threads to each row of a load, and eight rows, then eight more, to each warp. Tensor cores need sixteen
+neighbouring rows in a warp. The order of splats in a matrix is free, so rows are renumbered at no cost. A thread reads
+four numbers of a row at once, so latents come in sixteens. D, P, R and B: packing.py and kernels.py.
 """
 
 import triton
@@ -153,8 +153,8 @@ def load_latents(latents, rows, D: tl.constexpr, P: tl.constexpr, B: tl.constexp
 
 
 @triton.jit
-def give(pointers, values, mask, UNIQUE: tl.constexpr):
-    """Hand a row its gradient: rows that occur once are written, others are added up."""
+def store_gradients(pointers, values, mask, UNIQUE: tl.constexpr):
+    """Write gradients to rows of a table; with rows that may repeat (not UNIQUE), add them up."""
     if UNIQUE:
         tl.store(pointers, values, mask=mask)
     else:
@@ -162,12 +162,12 @@ def give(pointers, values, mask, UNIQUE: tl.constexpr):
 
 
 @triton.jit
-def give_latents(d_latents, rows, d_Z, valid, D: tl.constexpr, P: tl.constexpr, B: tl.constexpr, UNIQUE: tl.constexpr):
-    """The inverse of load_latents, for their gradients."""
+def store_latents(d_latents, rows, d_Z, valid, D: tl.constexpr, P: tl.constexpr, B: tl.constexpr, UNIQUE: tl.constexpr):
+    """`store_gradients` of d_Z [B, P], laid out as by load_latents."""
     stacked = tl.permute(tl.reshape(d_Z, (B, P // 16, 16)), (0, 2, 1))
     twos: tl.constexpr = 2 if P == 64 else 1 if P == 32 else 0
     pieces = unstack(tl.reshape(stacked, (B, 16) + (2,) * twos), P // 16)
     for i in tl.static_range(P // 16):
         columns = 16 * i + tl.arange(0, 16)[None, :]
         piece = tl.permute(tl.reshape(pieces[i], (B // 16, 2, 8, 4, 4)), (1, 0, 2, 4, 3))
-        give(d_latents + rows * D + columns, tl.reshape(piece, (B, 16)), valid & (columns < D), UNIQUE)
+        store_gradients(d_latents + rows * D + columns, tl.reshape(piece, (B, 16)), valid & (columns < D), UNIQUE)

@@ -4,7 +4,7 @@
 Tiles advance together in *slabs* of 16 splats of depth. After each slab the tiles that have run out of splats
 or of light leave, so hidden splats cost nothing. A slab is cut into batches of tiles with similar counts, so little is
 padded, and the arrays [B, n, 64] of a batch stay within `BATCH_ELEMENTS` for each thread, which bounds the memory. For
-the backward pass a batch keeps T in front of its slab and the numbers of its splats; all that is per pixel and splat is
+the backward pass a batch keeps T in front of its slab and its splats' coefficients; all that is per pixel and splat is
 computed again.
 
 Slabs are shallow so that batches are wide: torch divides only operations on more than 32,768 numbers among its threads,
@@ -47,28 +47,29 @@ def batch_elements() -> int:
     return BATCH_ELEMENTS * min(torch.get_num_threads(), MAX_THREADS)
 
 
-class Sheet:
-    """The constant part of the work: splats in depth order, the tile grid and its pixel basis.
+class Canvas:
+    """What all batches share: the F splats in depth order, the tile grid, a tile's pixel basis and scratch memory.
 
-    A row of a table holds all numbers of a splat, so that each pair fetches it once. Behind the last of the F splats
-    there is an invisible one, which pads lists that are too short.
+    A row of `geometry` or `conics_colors` has all numbers of a splat, so that each pair fetches it once. Row F is an
+    invisible splat, which pads lists that are too short.
     """
 
-    def __init__(self, prints: Footprints, colors: Tensor, n_cameras: int, width: int, height: int) -> None:
-        self.prints = prints
+    def __init__(self, footprints: Footprints, colors: Tensor, n_cameras: int, width: int, height: int) -> None:
+        self.footprints = footprints
         edge, dtype = SUB_TILE, colors.dtype
         # Conic and ln(o) divided by ln 2, because exp2 is three times faster than exp.
-        shape = torch.cat([prints.shape[:2], prints.shape[2:] / LN_2])  # [6, F], float64
-        padding = shape.new_tensor([[0.0, 0.0, 0.0, 0.0, 0.0, NOTHING]])
-        self.shape = torch.cat([shape.t(), padding])  # centre x, y, conic a, b, c, ln(o). [F + 1, 6], float64
-        self.looks = F.pad(torch.cat([-shape[2:5].t().to(dtype), colors], 1), (0, 0, 0, 1))  # -a, -b, -c, colours
+        columns = torch.cat([footprints.geometry[:2], footprints.geometry[2:] / LN_2])  # [6, F], float64
+        padding = columns.new_tensor([[0.0, 0.0, 0.0, 0.0, 0.0, NOTHING]])
+        self.geometry = torch.cat([columns.t(), padding])  # centre x, y, conic a, b, c, ln(o). [F + 1, 6], float64
+        minus_conics = -columns[2:5].t().to(dtype)
+        self.conics_colors = F.pad(torch.cat([minus_conics, colors], 1), (0, 0, 0, 1))  # [F + 1, 3 + D]
 
-        self.n_tiles = n_cameras * prints.tiles_y * prints.tiles_x
+        self.n_tiles = n_cameras * footprints.tiles_y * footprints.tiles_x
         offsets = torch.arange(edge, dtype=dtype) - (edge - 1) / 2
         y, x = (grid.flatten() for grid in torch.meshgrid(offsets, offsets, indexing="ij"))
         self.basis = torch.stack([torch.ones_like(x), x, y, x * x / 2, x * y, y * y / 2])  # [6, P]
 
-        # 1 in pixels of the images. [C * tiles, P]
+        # 1 inside the images, 0 in the part of a tile beyond their edge. [C * tiles, P]
         self.inside = self.tiled(torch.ones(n_cameras, height, width, 1, dtype=dtype)).squeeze(1)
         self.scratch = Scratch(max(batch_elements(), (SLAB + 1) * edge * edge), dtype)
         # The largest number below MIN_ALPHA: threshold_ keeps what is strictly greater.
@@ -76,19 +77,19 @@ class Sheet:
 
     def centres(self, tiles: Tensor) -> Tensor:
         """Centres x, y of tiles in pixels, y counted from the top of the first image. [L] -> [2, L, 1], float64"""
-        tiles_x = self.prints.tiles_x
+        tiles_x = self.footprints.tiles_x
         corners = torch.stack([tiles % tiles_x, tiles // tiles_x])[..., None]
         return (corners.double() + 0.5) * SUB_TILE
 
     def image(self, values: Tensor, n_cameras: int, width: int, height: int) -> Tensor:
         """Put tiles back into images. [C * tiles, D, P] -> [C, H, W, D]"""
-        edge, tiles_x, tiles_y = SUB_TILE, self.prints.tiles_x, self.prints.tiles_y
+        edge, tiles_x, tiles_y = SUB_TILE, self.footprints.tiles_x, self.footprints.tiles_y
         values = values.view(n_cameras, tiles_y, tiles_x, -1, edge, edge).permute(0, 1, 4, 2, 5, 3)
         return values.reshape(n_cameras, tiles_y * edge, tiles_x * edge, -1)[:, :height, :width].contiguous()
 
     def tiled(self, images: Tensor) -> Tensor:
         """Inverse of `image`, 0 outside the images. [C, H, W, D] -> [C * tiles, D, P]"""
-        edge, tiles_x, tiles_y = SUB_TILE, self.prints.tiles_x, self.prints.tiles_y
+        edge, tiles_x, tiles_y = SUB_TILE, self.footprints.tiles_x, self.footprints.tiles_y
         n_cameras, height, width, channels = images.shape
         images = F.pad(images, (0, 0, 0, tiles_x * edge - width, 0, tiles_y * edge - height))
         images = images.view(n_cameras, tiles_y, edge, tiles_x, edge, channels).permute(0, 1, 3, 5, 2, 4)
@@ -98,8 +99,8 @@ class Sheet:
 class Scratch:
     """Memory for the arrays of a batch, `size` numbers each, used by one batch after the other.
 
-    Getting megabytes from the system costs more than a pass of arithmetic, and making n slices a fifth of their
-    arithmetic.
+    To get megabytes from the system takes longer than a pass of arithmetic over them. Slices are kept, too: making them
+    takes a fifth of their arithmetic's time.
     """
 
     def __init__(self, size: int, dtype: torch.dtype) -> None:
@@ -118,13 +119,13 @@ class Scratch:
         return self._arrays[key]
 
 
-class Numbers(NamedTuple):
-    """The R = B n splats of a batch, with sigma expanded around the centres of their tiles."""
+class LocalSplats(NamedTuple):
+    """The R = B n splats of a batch in tile coordinates: l is expanded around the centres of their tiles."""
 
-    coefficients: Tensor  # of l / ln 2 in (1, x, y, x^2 / 2, xy, y^2 / 2). [6, R]
+    coefficients: Tensor  # of l / ln 2 in (1, x, y, x^2 / 2, xy, y^2 / 2): ln o - s, gx, gy, -a, -b, -c. [6, R]
     centres: Tensor  # mx, my. [2, R]
     colors: Tensor  # [B, n, D]
-    strong: Tensor  # rows of the R that can exceed an alpha of 0.999
+    strong: Tensor  # indices in 0..R-1 of those that can exceed an alpha of 0.999
 
 
 @dataclass
@@ -132,52 +133,52 @@ class Batch:
     """Tiles that are composited together over one slab: B tiles, n splats each, P pixels per tile."""
 
     tiles: Tensor  # positions in TileLists.tiles. [B]
-    pairs: Tensor  # of its tiles and splats; padding has the number of all pairs. [B, n]
-    numbers: Numbers
+    pairs: Tensor  # (tile, splat) pairs, as positions in TileLists.splat; K for padding. [B, n]
+    splats: LocalSplats
     transmittance: Tensor  # T where the slab begins; 0 in finished pixels. [B, P]
 
 
 def pairs_of(lists: TileLists, tiles: Tensor, first: int, n: int) -> Tensor:
-    """The pairs [B, n] of some tiles from depth `first` on; K, the padding, where a list is shorter."""
+    """The n pairs of each of B tiles from the `first` in depth on, [B, n]; K, the padding, where a list is shorter."""
     depth = torch.arange(first, first + n)
     start, count = lists.start.index_select(0, tiles), lists.count.index_select(0, tiles)
     return torch.where(depth < count[:, None], start[:, None] + depth, lists.n_pairs)
 
 
-def expand(sheet: Sheet, lists: TileLists, centres: Tensor, pairs: Tensor) -> Numbers:
-    """Fetch the splats of a batch and expand sigma around the centres of its tiles.
+def expand_around_centres(canvas: Canvas, lists: TileLists, centres: Tensor, pairs: Tensor) -> LocalSplats:
+    """Fetch the splats of a batch and expand l around the centres of its tiles, as in the module's docstring.
 
     Args:
         centres: x and y of the tiles' centres in pixels, as columns. [2, B, 1], float64
         pairs: [B, n]
     """
     splat = lists.splat.index_select(0, pairs.flatten())
-    x, y, a, b, c, log_opacity = sheet.shape.index_select(0, splat).view(*pairs.shape, 6).unbind(-1)
-    looks = sheet.looks.index_select(0, splat)
+    x, y, a, b, c, log_opacity = canvas.geometry.index_select(0, splat).view(*pairs.shape, 6).unbind(-1)
+    conics_colors = canvas.conics_colors.index_select(0, splat)
 
     mx, my = x - centres[0], y - centres[1]
     gx, gy = torch.addcmul(b * my, a, mx), torch.addcmul(b * mx, c, my)
-    peak = torch.add(log_opacity, torch.addcmul(mx * gx, my, gy), alpha=-0.5)
-    rows = looks.new_empty(8, *pairs.shape)  # the coefficients, then the splat's centre
-    for row, values in zip((0, 1, 2, 6, 7), (peak, gx, gy, mx, my), strict=True):
+    constant = torch.add(log_opacity, torch.addcmul(mx * gx, my, gy), alpha=-0.5)  # ln o - s
+    rows = conics_colors.new_empty(8, *pairs.shape)  # the coefficients, then the splat's centre
+    for row, values in zip((0, 1, 2, 6, 7), (constant, gx, gy, mx, my), strict=True):
         rows[row] = values
     rows = rows.flatten(1)
-    rows[3:6] = looks[:, :3].t()
+    rows[3:6] = conics_colors[:, :3].t()
     strong = (log_opacity > LOG2_NEARLY_MAX_ALPHA).flatten().nonzero().squeeze(1)
-    return Numbers(rows[:6], rows[6:], looks[:, 3:].view(*pairs.shape, -1), strong)
+    return LocalSplats(rows[:6], rows[6:], conics_colors[:, 3:].view(*pairs.shape, -1), strong)
 
 
-def similar_tiles(remaining: Tensor, tiles: Tensor, pixels: int) -> list[tuple[Tensor, int]]:
-    """Cut tiles, sorted by falling number of splats, into groups that fit into a batch: tiles, and their largest
-    number."""
+def group_by_count(remaining: Tensor, tiles: Tensor, pixels: int) -> list[tuple[Tensor, int]]:
+    """Cut tiles [L] with `remaining` splats in this slab, [L] and descending, into groups of similar counts that fit
+    into a batch: pairs of a group's tiles and their largest count."""
     counts = remaining.tolist()
     groups = []
     begin = 0
     elements = batch_elements()
     while begin < len(counts):
         end = min(len(counts), begin + max(1, elements // ((counts[begin] + 1) * pixels)))
-        enough = 0.75 * counts[begin] - 4  # bounds the padding to a quarter, or four splats
-        while counts[end - 1] < enough:
+        fewest = 0.75 * counts[begin] - 4  # bounds the padding to a quarter, or four splats
+        while counts[end - 1] < fewest:
             end -= 1
         groups.append((tiles[begin:end], counts[begin]))
         begin = end

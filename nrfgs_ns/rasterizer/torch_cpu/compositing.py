@@ -41,8 +41,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from .. import Projection
-from .batches import LN_2, MAX_ALPHA, SLAB, Batch, Numbers, Sheet, expand, pairs_of, similar_tiles
-from .tiles import TileLists, footprints, list_tiles, split_into_blocks
+from .batches import LN_2, MAX_ALPHA, SLAB, Batch, Canvas, LocalSplats, expand_around_centres, group_by_count, pairs_of
+from .tiles import TileLists, find_footprints, list_tiles, split_into_blocks
 
 MIN_TRANSMITTANCE = 1e-4  # a pixel ends before T falls to this
 BLOCK_PAIRS = 2**21  # (tile, splat) pairs listed at a time; about 200 bytes each, forward and backward
@@ -68,50 +68,48 @@ def full_precision() -> Iterator[None]:
 class _Blend:
     """A batch, composited. Most of it is scratch memory, which the next batch overwrites."""
 
-    alpha: Tensor  # 0 where splat k is not drawn, except in pixels that had ended before. [B, n, P]
-    alphas: tuple[Tensor, ...]  # its n slices. [B, P] each
-    through: Tensor  # T_0 ... T_n as if no pixel ended. [B, n + 1, P]
+    alphas: tuple[Tensor, ...]  # alpha_k, 0 where splat k is not drawn, except in pixels ended before. n of [B, P] each
     weights: Tensor  # w_k = alpha_k T_{k-1}. [B, n, P]
     last: Tensor  # T behind the slab, 0 in pixels that have ended. [B, P]
     ends: Tensor | None  # pixels that end in this slab, if any. [B, P]
     capped: tuple[Tensor, Tensor] | None  # rows (of B * n) that can exceed 0.999, and their pixels that do, if any
 
 
-def _blend(sheet: Sheet, numbers: Numbers, start: Tensor) -> _Blend:
+def _blend(canvas: Canvas, splats: LocalSplats, start: Tensor) -> _Blend:
     """The forward equations of the module docstring for one batch, from T in front of it [B, P].
 
     Arithmetic with zeros stands in for masks: filling by a mask costs as much as the exponential.
     """
-    n_tiles, n = numbers.colors.shape[:2]
+    n_tiles, n = splats.colors.shape[:2]
     pixels = start.shape[1]
-    alpha, alphas = sheet.scratch.array("alpha", n_tiles, n, pixels)
+    alpha, alphas = canvas.scratch.array("alpha", n_tiles, n, pixels)
     flat = alpha.view(-1, pixels)
-    torch.mm(numbers.coefficients.t(), sheet.basis, out=flat).exp2_()
-    F.threshold_(flat, sheet.too_faint, 0.0)
+    torch.mm(splats.coefficients.t(), canvas.basis, out=flat).exp2_()
+    F.threshold_(flat, canvas.too_faint, 0.0)
     capped = None
-    if numbers.strong.numel() > 0:
-        strong = flat.index_select(0, numbers.strong)
-        beyond = strong > MAX_ALPHA
-        if beyond.any():
-            capped = numbers.strong, beyond
-            flat.index_copy_(0, numbers.strong, strong.clamp_(max=MAX_ALPHA))
+    if splats.strong.numel() > 0:
+        strong = flat.index_select(0, splats.strong)
+        exceeds = strong > MAX_ALPHA
+        if exceeds.any():
+            capped = splats.strong, exceeds
+            flat.index_copy_(0, splats.strong, strong.clamp_(max=MAX_ALPHA))
 
-    through, steps = sheet.scratch.array("through", n_tiles, n + 1, pixels)  # T_0 ... T_n
-    steps[0].copy_(start)
-    for before, own, after in zip(steps, alphas, steps[1:], strict=False):
-        torch.addcmul(before, own, before, value=-1, out=after)  # T_k = T_{k-1} - alpha_k T_{k-1}
+    T, T_slices = canvas.scratch.array("T or U", n_tiles, n + 1, pixels)  # T_0 ... T_n, as if no pixel ended
+    T_slices[0].copy_(start)
+    for in_front, alpha_k, behind in zip(T_slices, alphas, T_slices[1:], strict=False):
+        torch.addcmul(in_front, alpha_k, in_front, value=-1, out=behind)  # T_k = T_{k-1} - alpha_k T_{k-1}
 
-    last = F.threshold(steps[-1], MIN_TRANSMITTANCE, 0.0)
+    last = F.threshold(T_slices[-1], MIN_TRANSMITTANCE, 0.0)
     ends = (last == 0) & (start > 0)
     some_end = bool(ends.any())
     if some_end:
-        drawn = torch.gt(through[:, 1:], MIN_TRANSMITTANCE, out=sheet.scratch.array("spare", n_tiles, n, pixels)[0])
+        drawn = torch.gt(T[:, 1:], MIN_TRANSMITTANCE, out=canvas.scratch.array("spare", n_tiles, n, pixels)[0])
         alpha *= drawn
-    weights = torch.mul(alpha, through[:, :-1], out=sheet.scratch.array("weights", n_tiles, n, pixels)[0])
-    return _Blend(alpha, alphas, through, weights, last, ends if some_end else None, capped)
+    weights = torch.mul(alpha, T[:, :-1], out=canvas.scratch.array("weights", n_tiles, n, pixels)[0])
+    return _Blend(alphas, weights, last, ends if some_end else None, capped)
 
 
-def _sweep(sheet: Sheet, lists: TileLists, final: Tensor, render: Tensor | None) -> list[Batch]:
+def _sweep(canvas: Canvas, lists: TileLists, final: Tensor, render: Tensor | None) -> list[Batch]:
     """Composite one block front to back; return its batches in the order of work, for the backward pass.
 
     Args:
@@ -119,29 +117,29 @@ def _sweep(sheet: Sheet, lists: TileLists, final: Tensor, render: Tensor | None)
         render: colours, added in place; None repeats a sweep for its batches only. [C * tiles, D, P]
     """
     record = []
-    live = sheet.inside.index_select(0, lists.tiles)  # T, or 0 in finished pixels. [L, P]
+    live = canvas.inside.index_select(0, lists.tiles)  # T, or 0 in finished pixels. [L, P]
     ended = torch.zeros_like(live)  # T where a pixel ended, or 0 in live pixels
-    centres = sheet.centres(lists.tiles)
+    centres = canvas.centres(lists.tiles)
     active = torch.arange(lists.tiles.numel())
     first = 0
     while active.numel() > 0:
         remaining = (lists.count.index_select(0, active) - first).clamp(max=SLAB)
         remaining, by_count = torch.sort(remaining, descending=True)
         active = active.index_select(0, by_count)
-        for tiles, n in similar_tiles(remaining, active, live.shape[1]):
+        for tiles, n in group_by_count(remaining, active, live.shape[1]):
             pairs = pairs_of(lists, tiles, first, n)
-            numbers = expand(sheet, lists, centres.index_select(1, tiles), pairs)
-            batch = Batch(tiles, pairs, numbers, live.index_select(0, tiles))
+            splats = expand_around_centres(canvas, lists, centres.index_select(1, tiles), pairs)
+            batch = Batch(tiles, pairs, splats, live.index_select(0, tiles))
             record.append(batch)
-            blend = _blend(sheet, numbers, batch.transmittance)
+            blend = _blend(canvas, splats, batch.transmittance)
             live.index_copy_(0, tiles, blend.last)
             if blend.ends is not None:
-                left = batch.transmittance - blend.weights.sum(1)  # T = 1 - sum of all w
-                ended.index_add_(0, tiles, left.mul_(blend.ends))
+                final_T = batch.transmittance - blend.weights.sum(1)  # T_n = T_0 - sum of w_k
+                ended.index_add_(0, tiles, final_T.mul_(blend.ends))
             if render is not None:
-                where = lists.tiles.index_select(0, tiles)
-                so_far = render.index_select(0, where)
-                render.index_copy_(0, where, so_far.baddbmm_(numbers.colors.transpose(1, 2), blend.weights))
+                on_canvas = lists.tiles.index_select(0, tiles)
+                nearer_slabs = render.index_select(0, on_canvas)
+                render.index_copy_(0, on_canvas, nearer_slabs.baddbmm_(splats.colors.transpose(1, 2), blend.weights))
         first += SLAB
         unfinished = (lists.count.index_select(0, active) > first) & (live.index_select(0, active).amax(1) > 0)
         active = active[unfinished]
@@ -150,34 +148,34 @@ def _sweep(sheet: Sheet, lists: TileLists, final: Tensor, render: Tensor | None)
 
 
 def _backward_batch(
-    sheet: Sheet, batch: Batch, grad: Tensor, behind: Tensor, absgrad: bool, gradients: Tensor
+    canvas: Canvas, batch: Batch, grad: Tensor, behind: Tensor, absgrad: bool, gradients: Tensor
 ) -> Tensor:
     """The backward equations of the module docstring for one batch; returns U in front of the first splat, [B, P].
 
     Args:
         grad: dL/dC of its tiles. [B, D, P]
-        behind: U of the last splat. [B, P]
+        behind: U_n, behind the last splat. [B, P]
         gradients: receives those of centre x, y, conic a, b, c, ln o, colours, then absgrad. [B * n, 6 + D (+ 2)]
     """
-    numbers, start = batch.numbers, batch.transmittance
-    blend = _blend(sheet, numbers, start)
-    n_tiles, n, pixels = blend.alpha.shape
-    worth, each_worth = sheet.scratch.array("spare", n_tiles, n, pixels)
-    torch.bmm(numbers.colors, grad, out=worth)  # e_k
-    beyond, steps = sheet.scratch.array("through", n_tiles, n + 1, pixels)  # U_0 ... U_n
-    steps[-1].copy_(behind)
+    splats, start = batch.splats, batch.transmittance
+    blend = _blend(canvas, splats, start)
+    n_tiles, n, pixels = blend.weights.shape
+    e, e_slices = canvas.scratch.array("spare", n_tiles, n, pixels)
+    torch.bmm(splats.colors, grad, out=e)
+    U, U_slices = canvas.scratch.array("T or U", n_tiles, n + 1, pixels)  # U_0 ... U_n
+    U_slices[-1].copy_(behind)
     for k in range(n - 1, -1, -1):
-        torch.lerp(steps[k + 1], each_worth[k], blend.alphas[k], out=steps[k])
-    in_front = torch.where(start > 0, steps[0], behind)
-    v = worth.sub_(beyond[:, 1:]).mul_(blend.weights).view(-1, pixels)  # dL/dl
+        torch.lerp(U_slices[k + 1], e_slices[k], blend.alphas[k], out=U_slices[k])
+    in_front = torch.where(start > 0, U_slices[0], behind)
+    v = e.sub_(U[:, 1:]).mul_(blend.weights).view(-1, pixels)  # dL/dl
     if blend.capped is not None:
-        where, pixels_capped = blend.capped
-        v[where] *= ~pixels_capped
+        strong, exceeds = blend.capped
+        v[strong] *= ~exceeds
 
-    channels = numbers.colors.shape[-1]
-    v0, vx, vy, vxx, vxy, vyy = sheet.basis @ v.t()  # sums of v, v x, v y, v x^2 / 2, v xy, v y^2 / 2
-    mx, my = numbers.centres
-    _, gx, gy, a, b, c = numbers.coefficients  # the conic's with a minus
+    channels = splats.colors.shape[-1]
+    v0, vx, vy, vxx, vxy, vyy = canvas.basis @ v.t()  # sums of v, v x, v y, v x^2 / 2, v xy, v y^2 / 2
+    mx, my = splats.centres
+    _, gx, gy, a, b, c = splats.coefficients  # here a, b, c are the conic's with a minus
     half_x, half_y = torch.addcmul(vx, mx, v0, value=-0.5), torch.addcmul(vy, my, v0, value=-0.5)
     by_x, by_y, by_a, by_b, by_c, by_log_opacity = gradients[:, :6].t()
     torch.mul(gx, v0, out=by_x).addcmul_(a, vx).addcmul_(b, vy)
@@ -190,20 +188,20 @@ def _backward_batch(
     gradients[:, 6 : 6 + channels].view(n_tiles, n, channels).copy_(of_colors.transpose(1, 2))
     if absgrad:
         size = v.abs_()
-        for axis, pull in enumerate(([gx, a, b], [gy, b, c])):  # -Q d is linear in the pixel
-            pulls = sheet.scratch.array("through", n_tiles, n, pixels)[0].view(-1, pixels)
-            torch.mm(torch.stack(pull).t(), sheet.basis[:3], out=pulls)
-            torch.sum(pulls.abs_().mul_(size), -1, out=gradients[:, 6 + channels + axis])
+        for axis, coefficients in enumerate(([gx, a, b], [gy, b, c])):  # -Q d is linear in the pixel: in (1, x, y)
+            minus_Q_d = canvas.scratch.array("T or U", n_tiles, n, pixels)[0].view(-1, pixels)
+            torch.mm(torch.stack(coefficients).t(), canvas.basis[:3], out=minus_Q_d)
+            torch.sum(minus_Q_d.abs_().mul_(size), -1, out=gradients[:, 6 + channels + axis])
     return in_front
 
 
 def _backward_block(
-    sheet: Sheet, lists: TileLists, work: list[Batch], grad: Tensor, behind: Tensor, absgrad: bool, n_columns: int
+    canvas: Canvas, lists: TileLists, work: list[Batch], grad: Tensor, behind: Tensor, absgrad: bool, n_columns: int
 ) -> Tensor:
     """Gradients of one block by its footprints, in the columns of `_backward_batch`. [F, columns]
 
     Args:
-        work: the batches of its sweep.
+        work: the batches of its `_sweep`.
         grad: dL/dC. [C * tiles, D, P]
         behind: U behind the last splat; afterwards U in front of the first one. [C * tiles, P]
     """
@@ -213,10 +211,11 @@ def _backward_block(
     gradients[end] = 0
     row_of_slot = torch.full((lists.n_pairs + 1,), end)
     for batch in reversed(work):
-        where = lists.tiles.index_select(0, batch.tiles)
+        on_canvas = lists.tiles.index_select(0, batch.tiles)
         begin = end - batch.pairs.numel()
-        grads = grad.index_select(0, where), behind.index_select(0, where)
-        behind.index_copy_(0, where, _backward_batch(sheet, batch, *grads, absgrad, gradients[begin:end]))
+        grads = grad.index_select(0, on_canvas), behind.index_select(0, on_canvas)
+        in_front = _backward_batch(canvas, batch, *grads, absgrad, gradients[begin:end])
+        behind.index_copy_(0, on_canvas, in_front)
         slots = lists.slot.index_select(0, batch.pairs.flatten())
         row_of_slot.index_copy_(0, slots, torch.arange(begin, end))
         end = begin
@@ -246,41 +245,41 @@ class CompositeSplats(torch.autograd.Function):
     @staticmethod
     @full_precision()
     def forward(ctx, means2d, conics, opacities, colors, projection: Projection, absgrad: bool):
-        prints = footprints(projection, opacities)
-        blocks = split_into_blocks(prints, BLOCK_PAIRS)
+        footprints = find_footprints(projection, opacities)
+        blocks = split_into_blocks(footprints, BLOCK_PAIRS)
         size = (projection.n_cameras, projection.width, projection.height)
-        sheet = Sheet(prints, colors.index_select(0, prints.rows), *size)
-        final = torch.ones_like(sheet.inside)
-        render = final.new_zeros(sheet.n_tiles, colors.shape[1], final.shape[1])
+        canvas = Canvas(footprints, colors.index_select(0, footprints.rows), *size)
+        final = torch.ones_like(canvas.inside)
+        render = final.new_zeros(canvas.n_tiles, colors.shape[1], final.shape[1])
         records = []
         for block in blocks:
-            lists = list_tiles(prints, block)
-            work = _sweep(sheet, lists, final, render)
+            lists = list_tiles(footprints, block)
+            work = _sweep(canvas, lists, final, render)
             # Records of several blocks would undo the bound on memory: the blocks are swept again instead.
             records.append((lists, work) if len(blocks) == 1 else None)
         ctx.save_for_backward(means2d, conics, opacities, colors)
-        ctx.sheet, ctx.blocks, ctx.records, ctx.absgrad = sheet, blocks, records, absgrad
-        return sheet.image(render, *size), sheet.image(final[:, None], *size)
+        ctx.canvas, ctx.blocks, ctx.records, ctx.absgrad = canvas, blocks, records, absgrad
+        return canvas.image(render, *size), canvas.image(final[:, None], *size)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     @full_precision()
     def backward(ctx, grad_render: Tensor, grad_transmittance: Tensor):
         means2d, conics, opacities, colors = ctx.saved_tensors
-        sheet = ctx.sheet
-        grad = sheet.tiled(grad_render)
-        behind = sheet.tiled(grad_transmittance).squeeze(1).clone()  # U behind the last drawn splat
+        canvas = ctx.canvas
+        grad = canvas.tiled(grad_render)
+        behind = canvas.tiled(grad_transmittance).squeeze(1).clone()  # U_n
         channels = colors.shape[1]
         n_columns = 6 + channels + (2 if ctx.absgrad else 0)
-        drawn = grad.new_zeros(sheet.prints.rows.numel(), n_columns)
+        drawn = grad.new_zeros(canvas.footprints.rows.numel(), n_columns)
         for block, record in zip(ctx.blocks, ctx.records, strict=True):
             if record is None:
-                lists = list_tiles(sheet.prints, block)
-                record = lists, _sweep(sheet, lists, torch.empty_like(sheet.inside), None)
-            drawn += _backward_block(sheet, *record, grad, behind, ctx.absgrad, n_columns)
+                lists = list_tiles(canvas.footprints, block)
+                record = lists, _sweep(canvas, lists, torch.empty_like(canvas.inside), None)
+            drawn += _backward_block(canvas, *record, grad, behind, ctx.absgrad, n_columns)
         drawn[:, :2] *= -LN_2  # the coefficients are those of l / ln 2
         drawn[:, 6 + channels :] *= LN_2
-        total = grad.new_zeros(means2d.shape[0], n_columns).index_copy_(0, sheet.prints.rows, drawn)
+        total = grad.new_zeros(means2d.shape[0], n_columns).index_copy_(0, canvas.footprints.rows, drawn)
         if ctx.absgrad:
             means2d.absgrad = total[:, -2:].contiguous()
         grad_opacities = total[:, 5] / opacities.where(opacities > 0, 1.0)

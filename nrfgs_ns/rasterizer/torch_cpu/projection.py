@@ -10,7 +10,7 @@ The camera flattens its covariance R_q diag(s^2) R_q^T with the Jacobian J of th
     cov2d = A A^T,      A = J W R_q diag(s)  (2 x 3),      J = [ f_x / p_z    0            -f_x u / p_z ]
                                                                [ 0            f_y / p_z    -f_y v / p_z ]
 
-where (u, v) = (p_x, p_y) / p_z, held within 0.3 tan(fov / 2) beyond the image edges: the linearisation is useless
+where (u, v) = (p_x, p_y) / p_z, clamped to within 0.3 tan(fov / 2) beyond the image edges: the linearisation is useless
 further out. A blur of e = 0.3 square pixels keeps every splat at least a pixel wide: cov2d + e I.
 
 Two determinants decide everything that follows, and both are differences of large numbers for a needle. Written with
@@ -19,10 +19,10 @@ the rows a_0, a_1 of A they are not:
     det(cov2d)       = |a_0 x a_1|^2
     det(cov2d + e I) = det(cov2d) + e trace(cov2d) + e^2.
 
-Backward, writing g(y) for dL/dy: each equation above, in reverse. The two less usual ones are
+Backward, each equation above in reverse. Here and in the code by_y stands for dL/dy. The two less usual ones are
 
-    g(a_0) = a_1 x g(n),    g(a_1) = g(n) x a_0         for the cross product n = a_0 x a_1,
-    g(q) = (g(q') - q' (q' . g(q'))) / |q|              for the direction q' = q / |q|.
+    by_a0 = a_1 x by_n,    by_a1 = by_n x a_0             for the cross product n = a_0 x a_1,
+    by_q = (by_q' - q' (q' . by_q')) / |q|                for the direction q' = q / |q|.
 
 All arrays hold one row per coordinate and one column per splat: each line below is one pass over memory.
 """
@@ -56,10 +56,10 @@ class _Screen(NamedTuple):
     det: Tensor  # det(cov2d), [n]
     det_blurred: Tensor  # det(cov2d + e I), [n]
     slopes: tuple[Tensor, Tensor]  # p_x / p_z, p_y / p_z, [n] each
-    held: tuple[Tensor, Tensor]  # u, v, [n] each
+    clamped: tuple[Tensor, Tensor]  # u, v, [n] each
     directions: Tensor  # quaternions of length 1, [4, n]
     rotations: Tensor  # R_q, [3, 3, n]
-    axes: tuple[Tensor, ...]  # rows of W R_q diag(s), [3, n] each
+    axes: list[Tensor]  # rows of W R_q diag(s), [3, n] each
     rows: tuple[Tensor, Tensor]  # a_0, a_1, [3, n] each
     normal: Tensor  # a_0 x a_1, [3, n]
 
@@ -104,7 +104,7 @@ def _to_screen(
 
     unit = directions(quats)
     rotations = rotation_matrices(unit)
-    right, down, forward = _rotate(W, rotations * scales.t())
+    right, down, forward = axes = _rotate(W, rotations * scales.t())
     a0, a1 = (fx / pz) * (right - u * forward), (fy / pz) * (down - v * forward)
 
     xx, xy, yy = (a0 * a0).sum(0), (a0 * a1).sum(0), (a1 * a1).sum(0)
@@ -112,7 +112,6 @@ def _to_screen(
     det = normal.square().sum(0)
     det_blurred = det + EPS2D * (xx + yy) + EPS2D**2
     blurred = xx + EPS2D, xy, yy + EPS2D
-    axes = right, down, forward
     return _Screen(means2d, pz, blurred, det, det_blurred, slopes, (u, v), unit, rotations, axes, (a0, a1), normal)
 
 
@@ -205,12 +204,12 @@ def _back_to_camera(
 ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
     """Gradients of the camera-space position p, [n] each, and of the rows of W R_q diag(s), [3, n] each."""
     fx, fy = K[0, 0], K[1, 1]
-    z, (u, v), (a0, a1) = screen.depths, screen.held, screen.rows
+    z, (u, v), (a0, a1) = screen.depths, screen.clamped, screen.rows
     right, down, forward = screen.axes
 
     by_conics = (by_conics / screen.det_blurred[:, None]).t().contiguous()
     by_yy, by_xy, by_xx = by_conics[0], -by_conics[1], by_conics[2]
-    # The slope of the root is held as in gsplat, 1 / (2 (sqrt(x) + 1e-6)): finite where a flat splat has x = 0.
+    # The slope of the root is bounded as in gsplat, 1 / (2 (sqrt(x) + 1e-6)): finite where a flat splat has x = 0.
     root = _compensations(screen)
     by_ratio = (by_compensations * 0.5 / (root + COMPENSATION_EPS)) / screen.det_blurred
     by_inverse = -(by_conics * _conics(screen).t()).sum(0)
@@ -229,9 +228,9 @@ def _back_to_camera(
     by_forward = -(u * by_right + v * by_down)
 
     by_slopes = []
-    for axis, (f, held, by_axis) in enumerate(((fx, u, by_right), (fy, v, by_down))):
-        free = held == screen.slopes[axis]
-        by_slopes.append(f * by_means2d[:, axis] - (by_axis * forward).sum(0).where(free, 0.0))
+    for axis, (f, clamped_slope, by_axis) in enumerate(((fx, u, by_right), (fy, v, by_down))):
+        unclamped = clamped_slope == screen.slopes[axis]
+        by_slopes.append(f * by_means2d[:, axis] - (by_axis * forward).sum(0).where(unclamped, 0.0))
     by_x, by_y = (by_slope / z for by_slope in by_slopes)
     by_z = by_z - by_x * screen.slopes[0] - by_y * screen.slopes[1]
     return (by_x, by_y, by_z), (by_right, by_down, by_forward)

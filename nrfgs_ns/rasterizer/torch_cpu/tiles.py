@@ -50,10 +50,10 @@ class Block(NamedTuple):
 class Footprints:
     """The F of M projected splats that can be seen, in depth order, and the sub-tiles around them."""
 
-    tiles_x: int  # sub-tiles per image row
-    tiles_y: int  # and column
-    rows: Tensor  # rows of the projection. [F], int64
-    shape: Tensor  # centre x, y (from the top of the stacked images), conic a, b, c, ln(opacity). [6, F], float64
+    tiles_x: int  # sub-tiles per row of an image
+    tiles_y: int  # sub-tiles per column of an image
+    rows: Tensor  # their rows in the projection. [F], int64
+    geometry: Tensor  # centre x, y (from the top of the stacked images), conic a, b, c, ln(opacity). [6, F], float64
     spans: Tensor  # first and end row, first and end column in sub-tiles of the stacked images. [4, F], int64
 
     @property
@@ -81,7 +81,7 @@ class TileLists:
 
 
 def _inclusive_range(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Sub-tiles [first, end) that have a pixel centre in [low, high] (pixels, float64). Centres lie at +0.5."""
+    """Sub-tiles [first, end) with a pixel centre in [low, high] (pixels, float64). Centres lie at +0.5."""
     return torch.ceil((low - (SUB_TILE - 0.5)) / SUB_TILE), torch.floor((high - 0.5) / SUB_TILE) + 1
 
 
@@ -91,8 +91,13 @@ def _square_range(centre: Tensor, radius: Tensor, n_tiles: int) -> tuple[Tensor,
     return (centre - radius).floor().clamp(0, n_tiles), (centre + radius).ceil().clamp(0, n_tiles)
 
 
-def footprints(projection: Projection, opacities: Tensor) -> Footprints:
-    """Bound every splat, with opacities [M], by gsplat's tiles and by its own 1/255 ellipse."""
+def _ellipse(a: Tensor, b: Tensor, c: Tensor, log_opacity: Tensor) -> tuple[Tensor, Tensor]:
+    """Determinant a c - b^2 of each conic, and 2 s of the module's docstring. [F] each"""
+    return a * c - b * b, 2 * (log_opacity - math.log(MIN_ALPHA) + REACH_SLACK)
+
+
+def find_footprints(projection: Projection, opacities: Tensor) -> Footprints:
+    """Bound every splat, with opacities [M], by gsplat's tiles and by its own 1/255 ellipse; drop invisible ones."""
     per_tile = TILE_SIZE // SUB_TILE
     width, height = projection.width, projection.height
     tiles_x, tiles_y = -(-width // SUB_TILE), -(-height // SUB_TILE)
@@ -114,22 +119,22 @@ def footprints(projection: Projection, opacities: Tensor) -> Footprints:
     limit = (a * c).sqrt() * (1 - 2.0**-22)
     b = torch.maximum(torch.minimum(b, limit), -limit)
     log_opacity = opacities.index_select(0, order).double().log()
-    shape = torch.stack([x.double(), y.double(), a, b, c, log_opacity])
+    geometry = torch.stack([x.double(), y.double(), a, b, c, log_opacity])
 
-    det, reach = a * c - b * b, 2 * (log_opacity - math.log(MIN_ALPHA) + REACH_SLACK)
-    half_x, half_y = (reach * c / det).sqrt(), (reach * a / det).sqrt()
-    col0, col1 = _inclusive_range(shape[0] - half_x, shape[0] + half_x)
-    row0, row1 = _inclusive_range(shape[1] - half_y, shape[1] + half_y)
+    det, two_s = _ellipse(a, b, c, log_opacity)
+    half_x, half_y = (two_s * c / det).sqrt(), (two_s * a / det).sqrt()
+    col0, col1 = _inclusive_range(geometry[0] - half_x, geometry[0] + half_x)
+    row0, row1 = _inclusive_range(geometry[1] - half_y, geometry[1] + half_y)
     col0, col1 = col0.maximum(x0 * per_tile), col1.minimum((x1 * per_tile).clamp(max=tiles_x))
     row0, row1 = row0.maximum(y0 * per_tile), row1.minimum((y1 * per_tile).clamp(max=tiles_y))
 
     kept = ((col0 < col1) & (row0 < row1)).nonzero().squeeze(1)
     spans = torch.stack([row0, row1, col0, col1]).index_select(1, kept).long()
-    order, shape = order.index_select(0, kept), shape.index_select(1, kept)
+    order, geometry = order.index_select(0, kept), geometry.index_select(1, kept)
     images_above = projection.camera_ids.index_select(0, order)
     spans[:2] += images_above * tiles_y
-    shape[1] += images_above * (tiles_y * SUB_TILE)
-    return Footprints(tiles_x, tiles_y, order, shape, spans)
+    geometry[1] += images_above * (tiles_y * SUB_TILE)
+    return Footprints(tiles_x, tiles_y, order, geometry, spans)
 
 
 def _clip(spans: Tensor, block: Block) -> Tensor:
@@ -140,14 +145,12 @@ def _clip(spans: Tensor, block: Block) -> Tensor:
     return torch.stack([row0, row1, col0, col1])
 
 
-def split_into_blocks(prints: Footprints, max_pairs: int) -> list[Block]:
+def split_into_blocks(footprints: Footprints, max_pairs: int) -> list[Block]:
     """Blocks of at most `max_pairs` pairs (by bounding boxes), or of one sub-tile, that cover all splats."""
 
     def split(block: Block) -> list[Block]:
         row0, row1, col0, col1 = block
-        if row0 >= row1 or col0 >= col1:
-            return []
-        clipped = _clip(prints.spans, block)
+        clipped = _clip(footprints.spans, block)
         pairs = ((clipped[1] - clipped[0]) * (clipped[3] - clipped[2])).sum()
         if pairs <= max_pairs or (row1 - row0 == 1 and col1 - col0 == 1):
             return [block] if pairs > 0 else []
@@ -157,12 +160,13 @@ def split_into_blocks(prints: Footprints, max_pairs: int) -> list[Block]:
         middle = (col0 + col1) // 2
         return split(block._replace(col1=middle)) + split(block._replace(col0=middle))
 
-    return split(prints.whole)
+    return split(footprints.whole)
 
 
-def list_tiles(prints: Footprints, block: Block) -> TileLists:
-    """List the splats of each sub-tile of a block, front to back. Two expansions: splat -> rows -> columns."""
-    row0, row1, col0, col1 = _clip(prints.spans, block)
+def list_tiles(footprints: Footprints, block: Block) -> TileLists:
+    """List the splats of each sub-tile of a block, front to back: each splat is expanded into rows, each row into
+    columns."""
+    row0, row1, col0, col1 = _clip(footprints.spans, block)
 
     # (splat, row) pairs, splat by splat.
     n_rows = row1 - row0
@@ -173,10 +177,10 @@ def list_tiles(prints: Footprints, block: Block) -> TileLists:
 
     # The columns that the ellipse covers on the pixel rows [y0, y1]: on the line dy, dx = slope dy -+ sqrt(widest -
     # narrowing dy^2).
-    x, y, a, b, c, log_opacity = prints.shape
-    det, reach = a * c - b * b, 2 * (log_opacity - math.log(MIN_ALPHA) + REACH_SLACK)
-    rightmost = -(b / c) * (reach * c / det).sqrt()
-    ellipse = torch.stack([x, y, rightmost, -b / a, reach / a, det / (a * a)])
+    x, y, a, b, c, log_opacity = footprints.geometry
+    det, two_s = _ellipse(a, b, c, log_opacity)
+    rightmost = -(b / c) * (two_s * c / det).sqrt()
+    ellipse = torch.stack([x, y, rightmost, -b / a, two_s / a, det / (a * a)])
     x, y, rightmost, slope, widest, narrowing = (column.index_select(0, splat) for column in ellipse)
     y0 = (row * SUB_TILE + 0.5) - y
     y1 = y0 + (SUB_TILE - 1)
@@ -193,11 +197,11 @@ def list_tiles(prints: Footprints, block: Block) -> TileLists:
     col_end = n_cols.cumsum(0)
     total = int(col_end[-1])
     entry = torch.repeat_interleave(n_cols, output_size=total)
-    tile = torch.arange(total) + (row * prints.tiles_x + first - col_end + n_cols).index_select(0, entry)
+    tile = torch.arange(total) + (row * footprints.tiles_x + first - col_end + n_cols).index_select(0, entry)
     splat_start = torch.cat([col_end.new_zeros(1), col_end]).index_select(0, row_end - n_rows)
 
     tile, slot = torch.sort(tile.to(torch.int32), stable=True)
     tiles, count = torch.unique_consecutive(tile, return_counts=True)
     splat = splat.index_select(0, entry).index_select(0, slot)
-    splat, slot = F.pad(splat, (0, 1), value=prints.rows.numel()), F.pad(slot, (0, 1), value=slot.numel())
+    splat, slot = F.pad(splat, (0, 1), value=footprints.rows.numel()), F.pad(slot, (0, 1), value=slot.numel())
     return TileLists(tiles.long(), count.cumsum(0) - count, count, splat, slot, splat_start)
