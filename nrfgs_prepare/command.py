@@ -191,8 +191,8 @@ class Run:
             models, mapping = structure.find_cameras(*place, names, enough, advance, say)
             if models == 0:
                 raise InputError(
-                    f"{self.options.photos}: photographs match, but no two of them are far enough apart to tell depth. "
-                    "Move the camera sideways instead of turning it; with few photographs try --features 8192."
+                    f"{self.options.photos}: photographs match, but too little to tell where they were taken. Take "
+                    "more, and move the camera sideways instead of turning it; with few try --features 8192."
                 )
             self.state |= {"models": models, "mapping": mapping}
 

@@ -197,23 +197,38 @@ def find_cameras(
     If few photographs are not all placed, all pairs are matched, with doubtful matches, too. Incremental mapping begins
     with two photographs from well separated places that share much, which a walk straight ahead lacks. If it places
     fewer than `enough` photographs, global mapping, which solves for all positions at once, is tried, too. The first
-    model with most photographs wins.
+    model with most photographs wins, where those that their matches contradict do not count: global mapping of few
+    photographs often places all of them, and most wrongly.
     """
     shutil.rmtree(folder, ignore_errors=True)
     models, mapping = _map_incrementally(database, photos, folder, advance), "incremental"
-    if _size(models)[0] < len(names) <= FEW:
-        say(f"{_size(models)[0]} of {len(names)} photographs are placed. Trying again with more matches, for minutes.")
+    placed = _placed(models, database)
+    if placed < len(names) <= FEW:
+        say(f"{placed} of {len(names)} photographs are placed. Trying again with more matches, for minutes.")
         with tempfile.TemporaryDirectory(dir=folder.parent) as place:
             others = _map_incrementally(_match_more(database, names, Path(place)), photos, folder, lambda _: None)
-        if _size(others)[0] > _size(models)[0]:
+        if _placed(others, database) > placed:
             models, mapping = others, "doubtful matches"
-    if _size(models)[0] < enough:
+    placed = _placed(models, database)
+    if placed < enough:
         others = _map_globally(database, photos, folder)
-        if _size(others)[0] > _size(models)[0]:
+        if _placed(others, database) > placed:
             models, mapping = others, "global"
-    if models:
-        write_model(max(models, key=lambda model: _size([model])), folder)
+    if _placed(models, database) < SMALLEST_MODEL:
+        return 0, mapping
+    write_model(max(models, key=lambda model: (_placed([model], database), model.num_points3D())), folder)
     return len(models), mapping
+
+
+def _placed(models: list[Any], database: Path) -> int:
+    """Photographs of the largest model, without those that their matches contradict; a model of which these are half or
+    more counts as none."""
+    counts = [0]
+    for model in models:
+        doubtful = len(doubtful_photographs(model, database))
+        certain = model.num_reg_images() - doubtful
+        counts.append(certain if certain > doubtful else 0)
+    return max(counts)
 
 
 def _match_more(database: Path, names: list[str], place: Path) -> Path:
@@ -244,13 +259,8 @@ def _check_model(folder: Path, model: Any) -> None:
         written = len(read_model(folder)[1]), len(read_points(folder)[0])
     except InputError:
         written = None
-    if written != _size([model]):
+    if written != (model.num_reg_images(), model.num_points3D()):
         raise InputError(f"{folder} {CUT}")
-
-
-def _size(models: list[Any]) -> tuple[int, int]:
-    """Photographs and points of the largest model."""
-    return max(((model.num_reg_images(), model.num_points3D()) for model in models), default=(0, 0))
 
 
 def _map_incrementally(database: Path, photos: Path, folder: Path, advance: Advance) -> list[Any]:

@@ -231,16 +231,33 @@ def test_global_mapping_helps_out_and_finds_the_same(prepared, walls, tmp_path, 
     check_walk(frames_of(out)[1])
 
 
+def with_turned(folder: Path, *names: str):
+    """The model of a scene with cameras turned by six degrees, 30 pixels."""
+    model = structure.colmap().Reconstruction(folder / "work" / "model")
+    for image in map(model.find_image_with_name, names):
+        turned = Rotation.from_rotvec([6, 0, 0], degrees=True).as_matrix() @ image.cam_from_world().matrix()
+        image.frame.set_cam_from_world(image.camera_id, structure.colmap().Rigid3d(turned))
+    return model
+
+
 def test_a_camera_that_its_matches_contradict_is_named(prepared, walls, tmp_path):
-    """Turned by six degrees, 30 pixels."""
     out = shutil.copytree(prepared, tmp_path / "scene")
-    model = structure.colmap().Reconstruction(out / "work" / "model")
-    image = model.find_image_with_name("IMG_03.png")
-    turned = Rotation.from_rotvec([6, 0, 0], degrees=True).as_matrix() @ image.cam_from_world().matrix()
-    image.frame.set_cam_from_world(image.camera_id, structure.colmap().Rigid3d(turned))
-    model.write(out / "work" / "model")
+    with_turned(out, "IMG_03.png").write(out / "work" / "model")
     assert "matches contradict: IMG_03.png. Look" in run_quietly(walls, out)
     assert verdict_of(out)["doubtful"] == ["IMG_03.png"] and verdict_of(prepared)["doubtful"] == []
+
+
+def test_a_model_that_its_matches_contradict_does_not_win(prepared, walls, tmp_path, monkeypatch):
+    out = shutil.copytree(prepared, tmp_path / "scene")
+    wrong = with_turned(out, "IMG_01.png", "IMG_03.png", "IMG_05.png")
+    monkeypatch.setattr(structure, "_map_incrementally", lambda *_: [wrong])
+    shutil.rmtree(out / "work" / "model")
+    assert "6 of 6 photographs" in run_quietly(walls, out)
+    assert verdict_of(out)["mapping"] == "global" and verdict_of(out)["doubtful"] == []
+    monkeypatch.setattr(structure, "_map_globally", lambda *_: [])
+    shutil.rmtree(out / "work" / "model")
+    with pytest.raises(InputError, match="too little to tell where"):
+        run_quietly(walls, out)
 
 
 @pytest.mark.parametrize(("make", "said"), [
