@@ -59,8 +59,7 @@ def pooled_deviation(samples: Sequence[Sequence[float]]) -> tuple[float | None, 
     freedom = sum(len(sample) - 1 for sample in several)
     if freedom == 0:
         return None, 0
-    squares = sum((len(sample) - 1) * statistics.variance(sample) for sample in several)
-    return math.sqrt(squares / freedom), freedom
+    return math.sqrt(sum((len(sample) - 1) * statistics.variance(sample) for sample in several) / freedom), freedom
 
 
 def noise_bound(deviation: float | None, freedom: int, n: int, m: int) -> float:

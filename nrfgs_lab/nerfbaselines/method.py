@@ -281,8 +281,7 @@ class World(NamedTuple):
 
 def _opengl(poses: np.ndarray) -> Tensor:
     """Poses [V, 3 or 4, 4] with y up and z backwards, float64 [V, 3, 4]."""
-    flip = np.array([1.0, -1.0, -1.0, 1.0])
-    return torch.from_numpy(np.asarray(poses, dtype=np.float64)[:, :3] * flip)
+    return torch.from_numpy(np.asarray(poses, dtype=np.float64)[:, :3] * np.array([1.0, -1.0, -1.0, 1.0]))
 
 
 def hold_in_memory(config: NrfgsDatamanagerConfig, dataset: dict[str, Any], world: World) -> None:

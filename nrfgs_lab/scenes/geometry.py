@@ -55,8 +55,7 @@ class Sphere:
         miss = m - b * directions
         half_chord_squared = self.radius**2 - dot(miss, miss)
         half_chord = np.sqrt(np.maximum(half_chord_squared, 0.0))
-        enter = np.where(half_chord_squared > 0.0, -b - half_chord, np.inf)
-        return enter, half_chord - b
+        return np.where(half_chord_squared > 0.0, -b - half_chord, np.inf), half_chord - b
 
     def local(self, points: Array) -> Array:
         """World points [3, N] in the body's frame, in which its surface lies within [-1, 1] on each axis."""

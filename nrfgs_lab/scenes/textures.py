@@ -33,8 +33,7 @@ class Waves:
         lengths = np.repeat(np.asarray(frequencies, dtype=np.float64), per_frequency)
         vectors = rng.normal(size=(len(lengths), 3))
         vectors *= (lengths / np.linalg.norm(vectors, axis=1))[:, None]
-        amplitudes = (1.0 / lengths) / (1.0 / lengths).sum()
-        return cls(vectors, rng.uniform(0.0, 2.0 * np.pi, len(lengths)), amplitudes)
+        return cls(vectors, rng.uniform(0.0, 2.0 * np.pi, len(lengths)), (1.0 / lengths) / (1.0 / lengths).sum())
 
     def __call__(self, points: Array) -> Array:
         """[3, N] to [N]."""
