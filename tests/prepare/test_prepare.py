@@ -218,21 +218,8 @@ def matches_in(database: Path) -> int:
         return sum(opened.read_two_view_geometry_num_inliers()[1])
 
 
-def test_global_mapping_helps_out_and_finds_the_same(prepared, walls, tmp_path, monkeypatch):
-    """As where incremental mapping finds no two photographs to begin with, even with doubtful ones: straight on."""
-    tried = []
-    monkeypatch.setattr(structure, "_map_incrementally", lambda database, *_: tried.append(matches_in(database)) or [])
-    out = shutil.copytree(prepared, tmp_path / "scene")
-    shutil.rmtree(out / "work" / "model")
-    assert "6 of 6 photographs" in run_quietly(walls, out)
-    verdict, before = verdict_of(out), verdict_of(prepared)
-    assert verdict["mapping"] == "global" and before["mapping"] == "incremental" and tried[1] > tried[0] > 0
-    assert verdict["mean_reprojection_error_px"] < 1.2 * before["mean_reprojection_error_px"]
-    check_walk(frames_of(out)[1])
-
-
 def with_turned(folder: Path, *names: str):
-    """The model of a scene with cameras turned by six degrees, 30 pixels."""
+    """The model of a scene with cameras turned by six degrees, 30 pixels, which their matches contradict."""
     model = structure.colmap().Reconstruction(folder / "work" / "model")
     for image in map(model.find_image_with_name, names):
         turned = Rotation.from_rotvec([6, 0, 0], degrees=True).as_matrix() @ image.cam_from_world().matrix()
@@ -240,24 +227,29 @@ def with_turned(folder: Path, *names: str):
     return model
 
 
+def test_global_mapping_helps_out_and_finds_the_same(prepared, walls, tmp_path, monkeypatch):
+    """As where incremental mapping, with doubtful matches, too, finds no model, or one that is wrong in half."""
+    out = shutil.copytree(prepared, tmp_path / "scene")
+    wrong = with_turned(out, "IMG_01.png", "IMG_03.png", "IMG_05.png")
+    tried = []
+    monkeypatch.setattr(structure, "_map_incrementally", lambda base, *_: tried.append(matches_in(base)) or [wrong])
+    shutil.rmtree(out / "work" / "model")
+    assert "6 of 6 photographs" in run_quietly(walls, out)
+    verdict, before = verdict_of(out), verdict_of(prepared)
+    assert verdict["mapping"] == "global" and before["mapping"] == "incremental" and tried[1] > tried[0] > 0
+    assert verdict["mean_reprojection_error_px"] < 1.2 * before["mean_reprojection_error_px"]
+    check_walk(frames_of(out)[1])
+    monkeypatch.setattr(structure, "_map_globally", lambda *_: [])
+    shutil.rmtree(out / "work" / "model")
+    with pytest.raises(InputError, match="too little to tell where"):
+        run_quietly(walls, out)
+
+
 def test_a_camera_that_its_matches_contradict_is_named(prepared, walls, tmp_path):
     out = shutil.copytree(prepared, tmp_path / "scene")
     with_turned(out, "IMG_03.png").write(out / "work" / "model")
     assert "matches contradict: IMG_03.png. Look" in run_quietly(walls, out)
     assert verdict_of(out)["doubtful"] == ["IMG_03.png"] and verdict_of(prepared)["doubtful"] == []
-
-
-def test_a_model_that_its_matches_contradict_does_not_win(prepared, walls, tmp_path, monkeypatch):
-    out = shutil.copytree(prepared, tmp_path / "scene")
-    wrong = with_turned(out, "IMG_01.png", "IMG_03.png", "IMG_05.png")
-    monkeypatch.setattr(structure, "_map_incrementally", lambda *_: [wrong])
-    shutil.rmtree(out / "work" / "model")
-    assert "6 of 6 photographs" in run_quietly(walls, out)
-    assert verdict_of(out)["mapping"] == "global" and verdict_of(out)["doubtful"] == []
-    monkeypatch.setattr(structure, "_map_globally", lambda *_: [])
-    shutil.rmtree(out / "work" / "model")
-    with pytest.raises(InputError, match="too little to tell where"):
-        run_quietly(walls, out)
 
 
 @pytest.mark.parametrize(("make", "said"), [
@@ -439,14 +431,14 @@ def test_the_sharpest_frame_of_each_piece_of_a_video_is_taken(tmp_path):
 
 # The whole way, on real photographs.
 @pytest.mark.slow
-@pytest.mark.parametrize(("scene", "first", "step", "wrong"), [("kitchen", 0, 2, []), ("castle", 1, 3, ["0022.jpg"])])
-def test_few_photographs_are_all_placed_or_doubtful(captures, tmp_path, scene, first, step, wrong):
+@pytest.mark.parametrize(("scene", "first", "step"), [("kitchen", 0, 2), ("castle", 1, 3)])
+def test_few_photographs_are_all_placed(captures, tmp_path, scene, first, step):
     """Usual matches place fewer of `kitchen`, around a table, and one of `castle` beyond its path."""
     photographs = [shutil.copy(path, tmp_path) for path in sorted((captures / scene / "images").iterdir())[first::step]]
     Prepare(tmp_path, tmp_path / "scene").main()
     verdict = verdict_of(tmp_path / "scene")
-    assert verdict["registered"] == len(photographs) and verdict["doubtful"][-1:] == wrong
-    assert verdict["mapping"] == ("incremental" if wrong else "doubtful matches")
+    assert verdict["registered"] == len(photographs) and verdict["doubtful"] == []
+    assert verdict["mapping"] == "doubtful matches"
 
 
 @pytest.mark.slow
