@@ -130,11 +130,10 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         """reads the next image while this one is trained on"""
         try:
             super().__init__(config, *args, **kwargs)
-        except (FileNotFoundError, LookupError) as error:  # of nerfstudio's own parsers
-            raise InputError(
-                f"{config.data or config.dataparser.data} cannot be read ({type(error).__name__}: {error}). Check the "
-                "path in --data or config.yml, and what kind of data set it is."
-            ) from error
+        except (OSError, LookupError, AttributeError, AssertionError) as error:  # of nerfstudio's own parsers
+            finding = f"cannot be read ({type(error).__name__}: {' '.join(str(error).split())})"
+            fix = "Check the path in --data or config.yml, and what kind of data set it is."
+            raise InputError(f"{config.data or config.dataparser.data} {finding}. {fix}") from error
 
     def load_all_images(self) -> None:
         """Decode all images. InputError if an image or a mask cannot be used, or nothing is visible in any training

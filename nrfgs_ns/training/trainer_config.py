@@ -53,6 +53,11 @@ class NrfgsTrainerConfig(TrainerConfig):
     """last steps over which parameters are averaged, at most a fiftieth of all. None: 200 if max_num_iterations is 0,
     otherwise 0"""
 
+    def __post_init__(self) -> None:
+        if self.load_config and (self.load_dir or self.load_checkpoint or self.data):
+            fix = "Give --load-config alone to train so again, or other options and no --load-config."
+            raise InputError(f"With --load-config {self.load_config} ns-train leaves other options out. {fix}")
+
     def setup(self, **kwargs) -> Trainer:
         """The trainer, for several devices the one that spreads the splats over them; InputError as `check`."""
         devices = kwargs.get("world_size", 1)
