@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """How trainings end before their last step, and that they go on from there to the parameters of the unbroken one."""
 
+import json
 import math
 import os
 import re
+import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -210,9 +212,19 @@ def test_another_scene_other_options_and_another_method_are_refused(finished, ti
     resumed = {"--load-dir": models_of(finished)}
     with pytest.raises(InputError, match="trained on other (poses|images)"):
         ready(other, tmp_path / "b", resumed, steps=STEPS + 2)
-    evaluated = parse(command_line("nrfgs", other, tmp_path, 1, BUSY)).pipeline.setup(device="cpu", test_mode="test")
-    evaluated.load_pipeline(checkpoint_of(finished)["pipeline"], STEPS)  # as ns-eval calls it
-    assert re.search(r"Warning: .*trained on other poses .*elsewhere\).* metrics are wrong", capsys.readouterr().out)
+    swapped = shutil.copytree(tiny_scene, tmp_path / "swapped") / "transforms.json"
+    meta = json.loads(swapped.read_text())
+    swapped.write_text(
+        json.dumps({**meta, "train_filenames": meta["test_filenames"], "test_filenames": meta["train_filenames"]})
+    )
+    for scene, warning in (
+        (other, r"trained on other poses .*elsewhere\).* metrics are wrong"),
+        (swapped, r"trained on images that are now for testing \(.* and 5 more\).* flatters"),
+    ):
+        config = parse(command_line("nrfgs", scene, tmp_path, 1, BUSY))
+        evaluated = config.pipeline.setup(device="cpu", test_mode="test")
+        evaluated.load_pipeline(checkpoint_of(finished)["pipeline"], STEPS)  # as ns-eval calls it
+        assert re.search(f"Warning: .*{warning}", capsys.readouterr().out)
     with pytest.raises(InputError, match="--pipeline.model.appearance.color-scale was 0.2 and is 0.3"):
         ready(tiny_scene, tmp_path / "c", resumed, {"--pipeline.model.appearance.color-scale": 0.3}, steps=STEPS + 2)
     own = {"step": 9, "pipeline": {"_model.gauss_params.means": torch.zeros(3, 3)}, "optimizers": {}, "schedulers": {}}
