@@ -118,11 +118,9 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
 
     def __init__(self, config: NrfgsDatamanagerConfig, *args: Any, **kwargs: Any):
         config.dataparser = checked(config.dataparser)
-        scale = config.camera_res_scale_factor
-        memory = config.image_memory
-        if not 0 < scale <= 16:
+        if not 0 < (scale := config.camera_res_scale_factor) <= 16:
             raise InputError(f"--pipeline.datamanager.camera-res-scale-factor is {scale}. Give more than 0, up to 16.")
-        if memory is not None and not memory >= 0:
+        if (memory := config.image_memory) is not None and not memory >= 0:
             raise InputError(f"--pipeline.datamanager.image-memory is {memory}. Give 0 or more gigabytes.")
         self._views: dict[int, Cameras] = {}
         """training cameras by index, kept since moving one to a GPU takes as long as a step"""
@@ -226,9 +224,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
 
     def sampling_state(self) -> dict[str, Any]:
         """State of the order of training cameras, of plain numbers, lists and tuples."""
-        generator = self.random_generator.getstate()
-        unseen = list(self.train_unseen_cameras)
-        return {"unseen_cameras": unseen, "generator": generator}
+        return {"unseen_cameras": list(self.train_unseen_cameras), "generator": self.random_generator.getstate()}
 
     def load_sampling_state(self, state: dict[str, Any]) -> None:
         """Continue the order of cameras from `sampling_state()` of the same images (`training/identity.py`)."""

@@ -57,14 +57,13 @@ def photograph_model(config: Any, datamanager: Any) -> PhotographModel | None:
     centers = dataset.cameras.camera_to_worlds[:, :3, 3].cpu()
     seen = estimate(pairs, torch.full_like(exif, torch.nan), centers)
     wanted = choice == "on" or they_differ(pairs, exif, seen)
-    outcome = f"exposure and white balance {'learnt' if wanted else 'not learnt'}"
     if choice == "on":
         reason = "as requested"
     elif wanted:
         reason = "since the photographs differ in brightness or colour"
     else:
         reason = f"since {'the photographs agree' if any(seen.random) else 'too few common points compare them'}"
-    CONSOLE.print(f"Photographs: {outcome}, {reason}.", soft_wrap=True)
+    CONSOLE.print(f"Photographs: exposure and white balance {'not ' * (not wanted)}learnt, {reason}.", soft_wrap=True)
     if not wanted:
         return None
     looks = estimate(pairs, exif, centers) if torch.isfinite(exif).any() else seen

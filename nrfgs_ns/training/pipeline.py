@@ -133,8 +133,7 @@ class NrfgsPipeline(VanillaPipeline):
                 warn(f"{error} Here metrics are wrong, and so is what is fitted to the views.")
             tests = {path.name for path in self.datamanager.eval_dataset.image_filenames}
             if known := sorted(tests & set(scene["images"]) - set(here["images"])):
-                finding = f"the checkpoint was trained on images that are now for testing ({some(known)})"
-                warn(f"{data}: {finding}, whose results this flatters.")
+                warn(f"{data}: test images were trained on ({some(known)}), whose results this flatters.")
         if self.config.compact is not None:
             state = model_state(self.model, decode(self.config.compact))
             loaded_state = {f"_model.{name}": value for name, value in state.items()}

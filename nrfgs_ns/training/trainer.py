@@ -114,8 +114,7 @@ class NrfgsTrainer(Trainer):
         self.mean = ParameterMean() if self.config.average_steps > 0 else None
         self.pace = self.config.pace()
         groups = self.pipeline.get_param_groups()
-        every = self.config.logging.steps_per_log
-        return LeanOptimizers(self.optimizer_configs(), groups, every, self.pace)
+        return LeanOptimizers(self.optimizer_configs(), groups, self.config.logging.steps_per_log, self.pace)
 
     # Resuming.
 
@@ -285,9 +284,8 @@ class NrfgsTrainer(Trainer):
         self._is_ending = True
         timed_out = isinstance(self.pace, TimedPace) and self.pace.is_spent
         if self._signal and not timed_out and self._made < self.last_step:
-            outcome = NOTHING_TO_SAVE
-            if self._made >= self._start_step:
-                outcome = f"Stopped at step {self._made}, saved. {self._save_once()}"
+            made = self._made >= self._start_step
+            outcome = f"Stopped at step {self._made}, saved. {self._save_once()}" if made else NOTHING_TO_SAVE
             self._end(outcome, 128 + self._signal)
         self.take_the_mean(stopped=self._stop and not timed_out)
         if self.line is not None:

@@ -55,8 +55,7 @@ class NrfgsTrainerConfig(TrainerConfig):
 
     def __post_init__(self) -> None:
         if self.load_config and (self.load_dir or self.load_checkpoint or self.data):
-            fix = "Give --load-config alone to train so again, or other options and no --load-config."
-            raise InputError(f"With --load-config {self.load_config} ns-train leaves other options out. {fix}")
+            raise InputError(f"--load-config {self.load_config} trains anew and takes no other option. Leave it out.")
 
     def setup(self, **kwargs) -> Trainer:
         """The trainer, for several devices the one that spreads the splats over them; InputError as `check`."""

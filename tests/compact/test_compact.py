@@ -266,8 +266,7 @@ def test_splats_that_go_take_what_an_optimizer_knows_of_them_along():
 def test_splats_in_a_plane_or_at_one_place_take_no_fewer_bits_than_none():
     """Their logarithm adapts the rate to a size."""
     means, steps = torch.rand(50, 3), torch.full((3,), 1e-3)
-    flat = bits_of_places(means * torch.tensor([1.0, 1.0, 0.0]), steps)
-    assert 12 < flat < bits_of_places(means, steps) - 8
+    assert 12 < bits_of_places(means * torch.tensor([1.0, 1.0, 0.0]), steps) < bits_of_places(means, steps) - 8
     assert bits_of_places(means[:1].expand(50, 3), steps) == 0
 
 

@@ -173,8 +173,7 @@ def test_a_training_with_the_line_is_the_one_without(tiny_scene, tmp_path, monke
         monkeypatch.setattr(progress, name, value)
     monkeypatch.setattr(progress, "CONSOLE", Console(file=said, force_terminal=False, width=200))
     options = {"--pipeline.model.densification": "splatfacto,warmup_length=2,refine_every=4"}
-    half = trained(command_line("nrfgs", tiny_scene, tmp_path / "half", 6, options))
-    load = {"--load-dir": models_of(half)}
+    load = {"--load-dir": models_of(trained(command_line("nrfgs", tiny_scene, tmp_path / "half", 6, options)))}
     quiet = trained(command_line("nrfgs", tiny_scene, tmp_path / "quiet", 12, options, load))
     assert not said.getvalue()
     spoken = trained(command_line("nrfgs", tiny_scene, tmp_path / "spoken", 12, options, load, SPOKEN))
