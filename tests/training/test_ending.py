@@ -246,6 +246,10 @@ def test_what_ns_train_says_before_it_begins(tiny_scene, tmp_path, monkeypatch, 
         parse(["nrfgs"]).print_to_terminal()
     with pytest.raises(InputError, match="typo: no such file or folder"):  # and no folder is made for it
         parse(["nrfgs", "--data", "typo"]).print_to_terminal()
+    with pytest.raises(InputError, match="both name a checkpoint"):
+        parse(["nrfgs", "--data", str(tiny_scene), "--load-dir", "a", "--load-checkpoint", "b"]).print_to_terminal()
+    with pytest.raises(SystemExit, match="2"):
+        parse(["nrfgs", "--load-config", "typo"])
     monkeypatch.chdir(tiny_scene)
     for words in ([], ["nrfgs-data", "--data", str(tiny_scene)]):
         config = parse(["nrfgs", *words])
