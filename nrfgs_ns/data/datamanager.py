@@ -118,11 +118,9 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
 
     def __init__(self, config: NrfgsDatamanagerConfig, *args: Any, **kwargs: Any):
         config.dataparser = checked(config.dataparser)
-        scale = config.camera_res_scale_factor
-        memory = config.image_memory
-        if not 0 < scale <= 16:
+        if not 0 < (scale := config.camera_res_scale_factor) <= 16:
             raise InputError(f"--pipeline.datamanager.camera-res-scale-factor is {scale}. Give more than 0, up to 16.")
-        if memory is not None and not memory >= 0:
+        if (memory := config.image_memory) is not None and not memory >= 0:
             raise InputError(f"--pipeline.datamanager.image-memory is {memory}. Give 0 or more gigabytes.")
         self._views: dict[int, Cameras] = {}
         """training cameras by index, kept since moving one to a GPU takes as long as a step"""
@@ -130,11 +128,10 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         """reads the next image while this one is trained on"""
         try:
             super().__init__(config, *args, **kwargs)
-        except (FileNotFoundError, LookupError) as error:  # of nerfstudio's own parsers
-            raise InputError(
-                f"{config.data or config.dataparser.data} cannot be read ({type(error).__name__}: {error}). Check the "
-                "path in --data or config.yml, and what kind of data set it is."
-            ) from error
+        except (OSError, LookupError, AttributeError, AssertionError) as error:  # of nerfstudio's own parsers
+            finding = f"cannot be read ({type(error).__name__}: {' '.join(str(error).split())})"
+            fix = "Check the path in --data or config.yml, and what kind of data set it is."
+            raise InputError(f"{config.data or config.dataparser.data} {finding}. {fix}") from error
 
     def load_all_images(self) -> None:
         """Decode all images. InputError if an image or a mask cannot be used, or nothing is visible in any training

@@ -302,6 +302,8 @@ def _advice_without_transforms(folder: Path) -> str:
     if folder.is_dir():
         if model := find_colmap(folder):
             return f"There is a COLMAP model: put `colmap --colmap-path {model}` at the end of the command."
+        if (folder / "transforms_train.json").exists():
+            return "There is one for each split: put `blender-data` at the end of the command."
         if any(file.suffix.lower() in PHOTOGRAPHS for pattern in ("*", "images/*") for file in folder.glob(pattern)):
             return f"For photographs without poses run `nrfgs prepare {quote(str(folder))} SCENE`, and train on SCENE."
     return "Point --data at a folder that holds one; `nrfgs prepare PHOTOS SCENE` makes one from photographs."

@@ -30,8 +30,7 @@ class Similarity:
     def inverse(self) -> "Similarity":
         if self is NOWHERE:
             return self
-        back = self.rotation.T / self.scale
-        return Similarity(self.rotation.T, 1.0 / self.scale, -back @ self.translation)
+        return Similarity(self.rotation.T, 1.0 / self.scale, -self.rotation.T / self.scale @ self.translation)
 
     def places(self, points: Tensor) -> Tensor:
         """Images of points [N, 3], float64."""

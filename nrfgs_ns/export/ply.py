@@ -83,9 +83,8 @@ def export_ply(load_config: Path, output: Path, options: PlyOptions, measure: bo
 
 def summary(output: Path, report: dict[str, Any]) -> Iterator[str]:
     """A report in sentences."""
-    harmonics = "its harmonics as they are"
-    if not report["exact"]:
-        harmonics = f"harmonics fitted over {report['training_views']} training views"
+    fitted = f"harmonics fitted over {report['training_views']} training views"
+    harmonics = "its harmonics as they are" if report["exact"] else fitted
     yield f"{output}: {report['written']:,} of {report['splats']:,} splats, {harmonics}, {report['bytes'] / 1e6:.1f} MB"
     if "origin" in report:
         yield f"Its coordinates are the capture's less {tuple(report['origin'])}, as its header says."

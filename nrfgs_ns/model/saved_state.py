@@ -46,8 +46,8 @@ def check_compatible(model: nn.Module, state: Mapping[str, Any]) -> None:
     same = f"Both have the '{written_by}' head, but of another size or with other switches of the model."
     other = f"The checkpoint was written by the '{written_by}' head and this model has the '{model.head.name}' head."
     fix = (
-        f"{same if written_by == model.head.name else other} Use the config.yml that was saved beside the checkpoint "
-        "(--load-config), or the same method and --pipeline.model options as in that training."
+        f"{same if written_by == model.head.name else other} Give the method and the --pipeline.model options of "
+        "the checkpoint's training: see the config.yml beside it."
     )
     tensors = {name: value for name, value in state.items() if isinstance(value, Tensor)}
     given, expected = _shapes(tensors), _shapes(model.state_dict())

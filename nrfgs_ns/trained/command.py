@@ -24,9 +24,8 @@ class Eval(NamesTraining):
 
     def main(self) -> None:
         path = self.config()
-        pictures = self.render_output_path
         check_writable(self.output_path, "--output-path")
-        if pictures is not None:
+        if (pictures := self.render_output_path) is not None:
             check_writable(pictures / "eval.png", "--render-output-path")
         from nrfgs_ns.threads import few_threads
         from nrfgs_ns.trained.loading import load_training
@@ -53,9 +52,7 @@ class View(NamesTraining):
 
     def main(self) -> None:
         path = self.config()
-        with path.open("rb") as file:
-            compact = file.read(len(MAGIC)) == MAGIC
-
+        compact = path.read_bytes().startswith(MAGIC)
         from nrfgs_ns.threads import few_threads
         from nrfgs_ns.viewer.server import LocalViewerConfig
 

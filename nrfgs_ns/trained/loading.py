@@ -43,11 +43,14 @@ def load_training(path: Path, mode: Literal["test", "inference"]) -> Trained:
     config = read_config(path)
     if not isinstance(config.pipeline, NrfgsPipelineConfig):
         raise InputError(f"{path}: a training of {config.method_name}. Use nerfstudio's own commands for it.")
-    places = [path.parent / config.relative_model_dir, config.get_checkpoint_dir()]
+    places = [path.absolute().parent / config.relative_model_dir, config.get_checkpoint_dir()]
     folder = next((place for place in places if find(place)), None)
     if folder is None:
-        raise InputError(f"{path}: no checkpoints in {places[0]}, nor in {places[1]}. Put them into the first.")
+        tried = ", nor in ".join(map(str, dict.fromkeys(places)))
+        raise InputError(f"{path}: no checkpoints in {tried}. Put them there, or train again.")
     find_data(config, path)
+    if config.pipeline.compact is not None and not config.pipeline.compact.exists():  # moved with FILE.nerfstudio
+        config.pipeline.compact = path.absolute().parents[2].with_suffix("")
     pipeline = config.pipeline.setup(device="cuda" if torch.cuda.is_available() else "cpu", test_mode=mode)
     pipeline.eval()
     checkpoint, content = read_latest(folder)

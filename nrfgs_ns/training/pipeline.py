@@ -126,12 +126,16 @@ class NrfgsPipeline(VanillaPipeline):
         """
         training = self.test_mode == "val"
         if (scene := loaded_state.get("_extra_state", {}).get("scene")) is not None:  # a compact file has none
+            here, data = self._data_set(), self.datamanager.get_datapath()
             try:
-                check_data_set(scene, self._data_set(), self.datamanager.get_datapath(), training)
+                check_data_set(scene, here, data, training)
             except InputError as error:
                 if training:
                     raise
                 warn(f"{error} Here metrics are wrong, and so is what is fitted to the views.")
+            tests = {path.name for path in self.datamanager.eval_dataset.image_filenames}
+            if known := sorted(tests & set(scene["images"]) - set(here["images"])):
+                warn(f"{data}: test images were trained on ({some(known)}), whose results this flatters.")
         if self.config.compact is not None:
             state = model_state(self.model, decode(self.config.compact))
             loaded_state = {f"_model.{name}": value for name, value in state.items()}

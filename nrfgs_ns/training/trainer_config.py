@@ -53,6 +53,11 @@ class NrfgsTrainerConfig(TrainerConfig):
     """last steps over which parameters are averaged, at most a fiftieth of all. None: 200 if max_num_iterations is 0,
     otherwise 0"""
 
+    def __post_init__(self) -> None:
+        file = self.load_config  # all that ns-train takes, if it is given
+        if file and (not file.is_file() or self.load_dir or self.load_checkpoint or self.data):
+            raise InputError(f"--load-config {file} trains anew, as that file says: name one, and no other option.")
+
     def setup(self, **kwargs) -> Trainer:
         """The trainer, for several devices the one that spreads the splats over them; InputError as `check`."""
         devices = kwargs.get("world_size", 1)
@@ -108,6 +113,8 @@ class NrfgsTrainerConfig(TrainerConfig):
         self.pipeline.model.check()
         if self.load_step is not None and self.load_dir is None:
             raise InputError(f"load_step is {self.load_step}, but there is no --load-dir. Give the folder, too.")
+        if None not in (self.load_dir, self.load_checkpoint):
+            raise InputError("--load-dir and --load-checkpoint both name a checkpoint. Give one.")
         if self.load_dir is not None:
             checkpoint_files.checkpoints_in(self.load_dir)
         elif (file := self.load_checkpoint) is not None and not file.is_file():

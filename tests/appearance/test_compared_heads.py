@@ -233,6 +233,5 @@ def test_features_are_continuous_across_cells_zero_and_the_cube(axis, grid):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_far_splats_find_rows_too(dtype, grid):
-    far = torch.tensor([[1e6, -1e6, 1e6], [-1e9, 1e9, 0.1], [1e30, -1e30, 0.0]], dtype=dtype)
-    features = grid.to(dtype)(far)
+    features = grid.to(dtype)(torch.tensor([[1e6, -1e6, 1e6], [-1e9, 1e9, 0.1], [1e30, -1e30, 0.0]], dtype=dtype))
     assert torch.isfinite(features).all() and (features != 0).any(dim=1).all()

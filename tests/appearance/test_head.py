@@ -96,8 +96,7 @@ def test_a_camera_on_the_splat_gives_finite_values_and_gradients(config, dtype, 
     splats, visible, _ = scene(head, dtype=dtype)
     splats = {name: value.requires_grad_() for name, value in splats.items()}
     splats["means"].data[visible[0]] = 0.0  # where 1e-20 is not lost in the sum
-    centers = splats["means"].detach()[visible] + offset
-    colors, opacities = head(splats, visible, centers)
+    colors, opacities = head(splats, visible, splats["means"].detach()[visible] + offset)
     (colors.sum() + opacities.sum()).backward()
     for value in (colors, opacities, *(splat.grad for splat in splats.values()), *(w.grad for w in head.parameters())):
         assert torch.isfinite(value).all()

@@ -32,8 +32,7 @@ def by_hand(head, splats, visible, centers):
         high_d = torch.cat([f(2.0**k * math.pi * d) for k in (1, 2) for f in (torch.sin, torch.cos)])
         a = layer(low, torch.cat([z, c, r.log(), alpha, low_d]))
         b = layer(high, torch.cat([z, c, r.log(), high_d]))
-        gate = 1 / (1 + torch.exp(-b[3]))
-        colors.append((c + 0.2 * torch.tanh(a[:3] + gate * b[:3])).clamp_min(0))
+        colors.append((c + 0.2 * torch.tanh(a[:3] + b[:3] / (1 + torch.exp(-b[3])))).clamp_min(0))
         opacities.append((alpha + 0.2 * torch.tanh(a[3:])).clamp(0, 1))
     return torch.stack(colors), torch.cat(opacities)
 

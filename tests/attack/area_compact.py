@@ -49,8 +49,7 @@ def claiming(name: str, change, hostile: bool = True) -> Case:
 def zeros(size: int) -> bytes:
     """Zeros, packed to next to nothing."""
     packer = lzma.LZMACompressor(format=lzma.FORMAT_XZ, check=lzma.CHECK_NONE, preset=0)
-    piece = bytes(2**20)
-    return b"".join([*(packer.compress(piece) for _ in range(size // 2**20)), packer.flush()])
+    return b"".join([*(packer.compress(bytes(2**20)) for _ in range(size // 2**20)), packer.flush()])
 
 
 def replaced(name: str, stream: str, count: int, body, **entry) -> Case:

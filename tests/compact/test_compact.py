@@ -189,13 +189,15 @@ def test_nerfstudios_commands_read_the_file(exported, tmp_path):
 
 def test_the_files_config_is_read_from_any_folder(exported, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    compact(exported[0], Path("it.nrf"), "--no-measure")
-    config = tmp_path / "it.nrf.nerfstudio" / "nrfgs" / "compact" / "config.yml"
+    compact(exported[0], Path("made/it.nrf"), "--no-measure")
+    config = tmp_path / "made" / "it.nrf.nerfstudio" / "nrfgs" / "compact" / "config.yml"
     monkeypatch.chdir("/")
     assert read_config(config).get_checkpoint_dir() == config.parent / "nerfstudio_models", "nerfstudio looks there"
     load_model(config, "test")
+    moved = (tmp_path / "made").rename(tmp_path / "moved")
+    load_model(moved / config.relative_to(tmp_path / "made"), "test")
     with pytest.raises(InputError, match="is a compact file. Name the config.yml in .*it.nrf.nerfstudio"):
-        load_model(tmp_path / "it.nrf", "test")
+        load_model(moved / "it.nrf", "test")
 
 
 def test_a_training_does_not_begin_with_a_compact_file(exported, tiny_scene, tmp_path):
@@ -264,8 +266,7 @@ def test_splats_that_go_take_what_an_optimizer_knows_of_them_along():
 def test_splats_in_a_plane_or_at_one_place_take_no_fewer_bits_than_none():
     """Their logarithm adapts the rate to a size."""
     means, steps = torch.rand(50, 3), torch.full((3,), 1e-3)
-    flat = bits_of_places(means * torch.tensor([1.0, 1.0, 0.0]), steps)
-    assert 12 < flat < bits_of_places(means, steps) - 8
+    assert 12 < bits_of_places(means * torch.tensor([1.0, 1.0, 0.0]), steps) < bits_of_places(means, steps) - 8
     assert bits_of_places(means[:1].expand(50, 3), steps) == 0
 
 

@@ -74,6 +74,9 @@ def test_data_that_is_not_there(tmp_path, capture):
         capture.parse(data=tmp_path / "nowhere")
     with pytest.raises(InputError, match=r"transforms.json is missing.*nrfgs prepare"):
         capture.parse(data=tmp_path)
+    (tmp_path / "transforms_train.json").touch()
+    with pytest.raises(InputError, match="transforms.json is missing.*`blender-data` at the end"):
+        capture.parse(data=tmp_path)
 
 
 def test_up_directions_that_cancel(capture):

@@ -5,6 +5,7 @@ import threading
 import numpy as np
 import pytest
 import torch
+from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
 from small_capture import Capture
@@ -181,6 +182,13 @@ def test_files_that_are_lost_or_cut_are_made_anew(capture, tmp_path, monkeypatch
     for path in (tmp_path / "cache").rglob("*.pt"):
         path.unlink() if left is None else os.truncate(path, left)
     torch.testing.assert_close([data["image"] for data in manager(capture, image_memory=0.0).cached_train], before)
+
+
+def test_data_of_another_kind_is_told(capture):
+    capture.meta = {"frames": []}
+    parser = InstantNGPDataParserConfig(data=capture.save().parent)
+    with pytest.raises(InputError, match=f"{capture.folder} cannot be read .AssertionError.* what kind of data set"):
+        NrfgsDatamanagerConfig(dataparser=parser).setup(device="cpu")
 
 
 def test_no_room_for_files_is_said(capture, tmp_path, monkeypatch):

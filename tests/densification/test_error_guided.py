@@ -117,8 +117,7 @@ def test_halves_keep_each_axis_variance_and_the_opacity(places):
             for name, value in table.splats.items():
                 state = table.optimizers[name].state[value]
                 assert not state["exp_avg"][half].any() and not state["exp_avg_sq"][half].any()
-    state = table.optimizers["means"].state[table.splats["means"]]
-    assert state["exp_avg"][1].all()
+    assert table.optimizers["means"].state[table.splats["means"]]["exp_avg"][1].all()
 
 
 def test_a_share_of_the_candidates_is_split_and_the_dead_are_replaced():

@@ -114,8 +114,7 @@ def test_what_is_seen_follows_the_stored_opacity():
     assert_close(rules.seen_opacity(table.splats["opacities"]), torch.tensor(expected))
     for row, stored in enumerate((0.001, 0.9, 0.1, 0.002)):
         table.set_opacity(row, stored)
-    expected = [0.001 + 0.15, 1.0, 0.1 / 2, 0.002]
-    assert_close(rules.seen_opacity(table.splats["opacities"]), torch.tensor(expected))
+    assert_close(rules.seen_opacity(table.splats["opacities"]), torch.tensor([0.001 + 0.15, 1.0, 0.1 / 2, 0.002]))
 
 
 def test_noise_spares_what_views_have_lately_shown():

@@ -270,6 +270,5 @@ def test_the_image_of_features_is_drawn_over_the_background_and_then_exposed():
     ((composited, rays),) = seen
     blended, alpha, _ = composite(view.projection, *appearance)
     assert torch.equal(composited, blended[0]) and torch.equal(rays, camera.rays())
-    image = alpha[0] * (composited[..., 1:4] + 0.1 * rays) + (1 - alpha[0]) * BACKGROUND
-    assert_close(drawn["rgb"], 0.5 * image)
+    assert_close(drawn["rgb"], 0.5 * (alpha[0] * (composited[..., 1:4] + 0.1 * rays) + (1 - alpha[0]) * BACKGROUND))
     assert 0.1 < alpha.mean() < 0.9 and drawn["depth"].shape == (7, 9, 1)

@@ -155,8 +155,7 @@ def test_light_runs_out_behind_many_opaque_splats(device):
     splats = {name: value.detach()[:1].repeat(100, *[1] * (value.dim() - 1)) for name, value in cloud().items()}
     splats["means"] = torch.tensor([0.0, 0.0, 1.0]) + torch.arange(100)[:, None] * torch.tensor([0.0, 0.0, 0.01])
     splats["scales"], splats["opacities"] = torch.full((100, 3), 1e6), torch.ones(100)
-    splats = {name: value.to(device).requires_grad_() for name, value in splats.items()}
-    _, alpha, _ = assert_healthy(splats)
+    _, alpha, _ = assert_healthy({name: value.to(device).requires_grad_() for name, value in splats.items()})
     assert torch.allclose(alpha, torch.full_like(alpha, 0.999), rtol=0, atol=1e-6)
 
 
@@ -180,8 +179,7 @@ def test_a_splat_that_is_not_finite_is_not_there(device, mode, value, name):
     assert torch.equal(image, expected[0]) and torch.equal(alpha, expected[1])
     for key in NAMES:
         # Sums over pixels and splats, which a GPU takes in any order: 1e-5 of the largest terms.
-        scale = without[key].grad.abs().max()
-        assert (splats[key].grad[1:] - without[key].grad).abs().max() <= 1e-5 * scale, key
+        assert (splats[key].grad[1:] - without[key].grad).abs().max() <= 1e-5 * without[key].grad.abs().max(), key
         assert (splats[key].grad[0] == 0).all(), key
     if name in ("means", "quats", "scales"):
         assert 0 not in info["gaussian_ids"]
@@ -199,8 +197,7 @@ def calls(monkeypatch) -> list[int]:
         harmless = [torch.nan_to_num(table, 0.5, 0.5, 0.5) for table in (means, quats, scales)]
         options = ProjectionOptions("antialiased" if calc_compensations else "classic")
         p = project(*harmless, viewmats, Ks, width, height, options)
-        spoilt = ~torch.isfinite(means[p.gaussian_ids]).all(1)
-        conics = p.conics.masked_fill(spoilt[:, None], math.nan)
+        conics = p.conics.masked_fill(~torch.isfinite(means[p.gaussian_ids]).all(1)[:, None], math.nan)
         sides = p.radii[:, None].expand(-1, 2) if gsplat_cuda.HAS_BATCHES else p.radii
         rows = p.camera_ids, p.gaussian_ids, sides, p.means2d, p.depths, conics, p.compensations
         return rows[:1] * gsplat_cuda.HAS_BATCHES + rows
@@ -226,8 +223,7 @@ def test_rows_that_gsplat_lets_through_as_nan_are_projected_away(calls):
 @modes
 @pytest.mark.parametrize("bad", [None, math.nan])
 def test_gsplats_projection_never_sees_an_empty_table(calls, mode, bad):
-    count = 0 if bad is None else 2
-    splats = {name: value.detach()[:count].requires_grad_() for name, value in cloud().items()}
+    splats = {name: value.detach()[: 0 if bad is None else 2].requires_grad_() for name, value in cloud().items()}
     if bad is not None:
         splats["means"] = torch.full((2, 3), bad, requires_grad=True)
     p = by_gsplat(splats, rasterize_mode=mode)

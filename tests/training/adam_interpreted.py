@@ -48,8 +48,7 @@ def test_steps_are_torchs(monkeypatch):
     begins later, one is replaced, a rate falls."""
     monkeypatch.setattr(adam_triton, "BLOCK", 64)
     torch.manual_seed(0)
-    shapes = [(70, 3), (5,), (64,), (1,)]
-    mine = [adam(shape, **options) for shape, options in zip(shapes, OPTIONS, strict=True)]
+    mine = [adam(shape, **options) for shape, options in zip([(70, 3), (5,), (64,), (1,)], OPTIONS, strict=True)]
     theirs, table = deepcopy(mine), AdamTable(CPU)
     for turn in range(4):
         stepping = [i for i in range(4) if i != 1 or turn > 0]

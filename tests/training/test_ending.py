@@ -16,6 +16,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from short_trainings import assert_same_training, checkpoint_of, command_line, config_with, models_of, set_up, trained
 
 from nrfgs_lab.training_run import parse
+from nrfgs_ns.data.datamanager import NrfgsDatamanager
 from nrfgs_ns.densification import Splatfacto
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training import checkpoint_files, stopping
@@ -90,9 +91,7 @@ def test_a_signal_before_the_first_step_saves_nothing_and_a_paused_training_hear
 
 def test_ctrl_c_while_images_are_read_is_one_line(tiny_scene, tmp_path, capsys, monkeypatch):
     trainer = parse(command_line("nrfgs", tiny_scene, tmp_path, STEPS)).setup(local_rank=0, world_size=1)
-
-    reading = "nrfgs_ns.data.datamanager.NrfgsDatamanager.load_all_images"
-    monkeypatch.setattr(reading, Mock(side_effect=KeyboardInterrupt()))
+    monkeypatch.setattr(NrfgsDatamanager, "load_all_images", Mock(side_effect=KeyboardInterrupt()))
     with pytest.raises(SystemExit) as ended:
         trainer.setup()
     assert ended.value.code == 130 and "Stopped before the first step" in capsys.readouterr().out
@@ -211,8 +210,12 @@ def test_another_scene_other_options_and_another_method_are_refused(finished, ti
     with pytest.raises(InputError, match="trained on other (poses|images)"):
         ready(other, tmp_path / "b", resumed, steps=STEPS + 2)
     evaluated = parse(command_line("nrfgs", other, tmp_path, 1, BUSY)).pipeline.setup(device="cpu", test_mode="test")
-    evaluated.load_pipeline(checkpoint_of(finished)["pipeline"], STEPS)  # as ns-eval calls it
-    assert re.search(r"Warning: .*trained on other poses .*elsewhere\).* metrics are wrong", capsys.readouterr().out)
+    state = checkpoint_of(finished)["pipeline"]
+    state["_extra_state"]["scene"]["images"][0] = evaluated.datamanager.eval_dataset.image_filenames[0].name
+    evaluated.load_pipeline(state, STEPS)  # as ns-eval calls it
+    said = capsys.readouterr().out
+    for warning in (r"other poses .*elsewhere\).* metrics are wrong", r"test images were trained on \(view_...\.png\)"):
+        assert re.search(f"Warning: .*{warning}", said), warning
     with pytest.raises(InputError, match="--pipeline.model.appearance.color-scale was 0.2 and is 0.3"):
         ready(tiny_scene, tmp_path / "c", resumed, {"--pipeline.model.appearance.color-scale": 0.3}, steps=STEPS + 2)
     own = {"step": 9, "pipeline": {"_model.gauss_params.means": torch.zeros(3, 3)}, "optimizers": {}, "schedulers": {}}
@@ -243,6 +246,10 @@ def test_what_ns_train_says_before_it_begins(tiny_scene, tmp_path, monkeypatch, 
         parse(["nrfgs"]).print_to_terminal()
     with pytest.raises(InputError, match="typo: no such file or folder"):  # and no folder is made for it
         parse(["nrfgs", "--data", "typo"]).print_to_terminal()
+    with pytest.raises(InputError, match="both name a checkpoint"):
+        parse(["nrfgs", "--data", str(tiny_scene), "--load-dir", "a", "--load-checkpoint", "b"]).print_to_terminal()
+    with pytest.raises(SystemExit, match="2"):
+        parse(["nrfgs", "--load-config", "typo"])
     monkeypatch.chdir(tiny_scene)
     for words in ([], ["nrfgs-data", "--data", str(tiny_scene)]):
         config = parse(["nrfgs", *words])

@@ -16,7 +16,7 @@ from rich.console import Console
 from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained, untrained
 from torch.testing import assert_close
 
-from nrfgs_lab.training_run import evaluate
+from nrfgs_lab.training_run import evaluate, parse
 from nrfgs_ns.appearance import gsnb, sg
 from nrfgs_ns.data.pictures import read_size
 from nrfgs_ns.densification import Splatfacto
@@ -158,7 +158,9 @@ def test_checkpoint_of_another_head_is_refused(method, more, says, finished, tin
     args = options(tiny_scene, tmp_path, method, {"--load-dir": models_of(finished("nrfgs"))}, more)
     with pytest.raises(InputError, match=says) as error:
         set_up(args)
-    assert "--load-config" in str(error.value)
+    assert "the config.yml beside it" in str(error.value)
+    with pytest.raises(SystemExit, match="2"):  # ns-train would take that file alone, and begin anew
+        parse([*args, "--load-config", str(finished("nrfgs"))])
 
 
 SPOKEN = {"--logging.local-writer.enable": True, "--logging.steps-per-log": 1}
@@ -171,8 +173,7 @@ def test_a_training_with_the_line_is_the_one_without(tiny_scene, tmp_path, monke
         monkeypatch.setattr(progress, name, value)
     monkeypatch.setattr(progress, "CONSOLE", Console(file=said, force_terminal=False, width=200))
     options = {"--pipeline.model.densification": "splatfacto,warmup_length=2,refine_every=4"}
-    half = trained(command_line("nrfgs", tiny_scene, tmp_path / "half", 6, options))
-    load = {"--load-dir": models_of(half)}
+    load = {"--load-dir": models_of(trained(command_line("nrfgs", tiny_scene, tmp_path / "half", 6, options)))}
     quiet = trained(command_line("nrfgs", tiny_scene, tmp_path / "quiet", 12, options, load))
     assert not said.getvalue()
     spoken = trained(command_line("nrfgs", tiny_scene, tmp_path / "spoken", 12, options, load, SPOKEN))

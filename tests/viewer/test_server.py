@@ -65,8 +65,7 @@ def answer(address: str, port: int, path: str, *headers: str, host: str | None =
 def upgrade(address: str, port: int, *headers: str, host: str | None = None) -> int:
     """Status of the answer to a wish for a WebSocket; 101 is yes."""
     wish = ["Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13"]
-    key = "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="
-    return answer(address, port, "/", *wish, key, *headers, host=host)[0]
+    return answer(address, port, "/", *wish, "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", *headers, host=host)[0]
 
 
 @pytest.mark.parametrize("options", [LocalViewerConfig(), ViewerConfig()], ids=["ours", "nerfstudio's default"])

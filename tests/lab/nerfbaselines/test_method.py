@@ -107,8 +107,7 @@ def test_a_checkpoint_renders_without_the_images(tiny_scene, tmp_path):
 def test_a_training_goes_on_as_if_it_had_not_stopped(tiny_scene, tmp_path):
     """`nrfgs-fast`, whose place in its schedules, three steps for each one, is part of the checkpoint."""
     dataset = read(tiny_scene, "train")
-    options = {"pipeline.model.num_downscales": 0}
-    unbroken = NrfgsFast(train_dataset=dataset, config_overrides=options)
+    unbroken = NrfgsFast(train_dataset=dataset, config_overrides={"pipeline.model.num_downscales": 0})
     train(unbroken, 0, 3)
     unbroken.save(str(tmp_path / "checkpoint"))
     assert unbroken.trainer.pace.position == pytest.approx(9.0, abs=1e-9)

@@ -44,8 +44,7 @@ def test_numbers_are_those_of_the_records_and_files_that_a_page_names_are_there(
 def test_decibels_in_prose_stand_in_a_block_of_the_page(name):
     inside = " ".join(content for *_, content in BLOCK.findall(PAGES[name]))
     prose = re.sub(r"```.*?```|`[^`\n]*`", "", BLOCK.sub("", PAGES[name]), flags=re.DOTALL)
-    loose = set(re.findall(r"(?<![\d.])(\d+(?:\.\d+)?) dB", prose))
-    assert not loose - set(re.findall(r"\d+(?:\.\d+)?", inside))
+    assert not set(re.findall(r"(?<![\d.])(\d+(?:\.\d+)?) dB", prose)) - set(re.findall(r"\d+(?:\.\d+)?", inside))
 
 
 def anchors(text: str) -> set[str]:
