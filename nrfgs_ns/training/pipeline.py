@@ -133,7 +133,7 @@ class NrfgsPipeline(VanillaPipeline):
                 if training:
                     raise
                 warn(f"{error} Here metrics are wrong, and so is what is fitted to the views.")
-            tests = {path.name for path in self.datamanager.eval_dataset.image_filenames}
+            tests = {Path(name).name for name in self.datamanager.eval_dataset.image_filenames}
             if known := sorted(tests & set(scene["images"]) - set(here["images"])):
                 warn(f"{data}: test images were trained on ({some(known)}), whose results this flatters.")
         if self.config.compact is not None:
