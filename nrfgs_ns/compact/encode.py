@@ -79,8 +79,7 @@ def encode(
     grids, codes = {}, {}
     for name, table in tables.items():
         values = table.cpu().numpy()
-        low = values.min(axis=0) if name == "means" else np.zeros(values.shape[1])
-        grids[name] = Grid(low, steps[name])
+        grids[name] = Grid(values.min(axis=0) if name == "means" else np.zeros(values.shape[1]), steps[name])
         codes[name] = grids[name].codes(values).clip(-LARGEST_CODE, LARGEST_CODE)
 
     places = morton(codes["means"])

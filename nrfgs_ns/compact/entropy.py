@@ -248,8 +248,7 @@ def _coded(
             fs = f[step, :count]
             x = push(x, limits[step, :count])
             quotient = x // fs
-            x = (quotient << np.uint64(PRECISION)) + (x - quotient * fs) + start[step, :count]
-            state[:count] = x
+            state[:count] = (quotient << np.uint64(PRECISION)) + (x - quotient * fs) + start[step, :count]
     return state.astype("<u4").tobytes() + b"".join(chunk.tobytes() for chunk in reversed(chunks))
 
 

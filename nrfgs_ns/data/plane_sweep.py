@@ -134,8 +134,7 @@ def inverse_depths(views: Views, one: int, others: Tensor, near: float, far: flo
     turned, shift = _transfer(views, one, others)
     ends = [rays @ turned.mT + shift[:, None] * (1 / depth) for depth in (near, far)]
     first, last = (end[..., :2] / end[..., 2:].clamp_min(1e-6) for end in ends)
-    visible = (ends[0][..., 2] > 1e-6) & (ends[1][..., 2] > 1e-6)
-    moved = (first - last).norm(dim=-1)[visible]
+    moved = (first - last).norm(dim=-1)[(ends[0][..., 2] > 1e-6) & (ends[1][..., 2] > 1e-6)]
     count = float(moved.quantile(0.9)) if len(moved) else 0.0
     return torch.linspace(1 / far, 1 / near, int(min(max(2 * count, PLANES[0]), PLANES[1])), device=rays.device)
 

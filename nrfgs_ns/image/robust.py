@@ -62,8 +62,7 @@ class Trimming(nn.Module):
 
     def _quantile(self, share: float) -> Tensor:
         """The residual below which this share of those remembered lies, a scalar."""
-        reached = self.histogram.cumsum(0) >= share * self.histogram.sum()
-        return (BINS - reached.sum() + 1) / BINS
+        return (BINS - (self.histogram.cumsum(0) >= share * self.histogram.sum()).sum() + 1) / BINS
 
 
 def _mean_around(values: Tensor, side: int) -> Tensor:

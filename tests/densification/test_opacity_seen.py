@@ -110,8 +110,7 @@ def test_what_is_seen_follows_the_stored_opacity():
     rules = strategy("mcmc")
     for shown, row in ((0.45, 0), (0.35, 0), (0.5, 1), (0.2, 2), (0.4, 2)):
         table.step(rules, 10, shown=shown, seen=slice(row, row + 1))
-    expected = [0.45, 0.5, 0.4, 0.3]
-    assert_close(rules.seen_opacity(table.splats["opacities"]), torch.tensor(expected))
+    assert_close(rules.seen_opacity(table.splats["opacities"]), torch.tensor([0.45, 0.5, 0.4, 0.3]))
     for row, stored in enumerate((0.001, 0.9, 0.1, 0.002)):
         table.set_opacity(row, stored)
     assert_close(rules.seen_opacity(table.splats["opacities"]), torch.tensor([0.001 + 0.15, 1.0, 0.1 / 2, 0.002]))

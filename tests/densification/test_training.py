@@ -71,8 +71,7 @@ def test_growth_that_memory_holds_is_held_in_a_continued_training(densification,
     """Whatever memory there seems to be then: it is measured otherwise in another process."""
     measured = iter([310])
     monkeypatch.setattr(memory, "most_splats", lambda *_: next(measured, 10**6))
-    half = run("half", densification, 14)
-    rest, measured = run("rest", densification, 26, half), iter([310])
+    rest, measured = run("rest", densification, 26, run("half", densification, 14)), iter([310])
     assert_same_training(run("whole", densification, 26), rest, rtol=0, atol=0)
     assert 300 <= len(rest["pipeline"]["_model.gauss_params.means"]) <= 310
     assert rest["pipeline"]["_model._extra_state"]["strategy"][GROWTH_LIMIT] == (310, 0)

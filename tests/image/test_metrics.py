@@ -24,8 +24,7 @@ def pair(height: int, width: int, noise: float = 0.1, dtype=torch.float32) -> tu
     generator = torch.Generator().manual_seed(height * 1000 + width)
     y, x = torch.meshgrid(torch.linspace(0, 6, height), torch.linspace(0, 9, width), indexing="ij")
     gt = 0.5 + 0.3 * torch.stack([torch.sin(x * y), torch.cos(x + y), torch.sin(3 * x)], dim=-1)
-    pred = gt + noise * torch.randn(gt.shape, generator=generator)
-    return pred.clamp(0, 1).to(dtype), gt.to(dtype)
+    return (gt + noise * torch.randn(gt.shape, generator=generator)).clamp(0, 1).to(dtype), gt.to(dtype)
 
 
 def disc(height: int, width: int, radius: float) -> torch.Tensor:

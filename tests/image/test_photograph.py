@@ -74,8 +74,7 @@ def test_patterns_that_are_the_scenes_stay_as_they_started():
     torch.manual_seed(0)
     ramp, constant = torch.linspace(-1.0, 1.0, 6)[:, None], torch.full((6, 1), 6**-0.5)
     held = [torch.cat([constant, ramp / ramp.norm()], dim=1), constant, constant]
-    start = torch.randn(6, 3)
-    model = PhotographModel([str(index) for index in range(6)], start=start, held=held)
+    model = PhotographModel([str(index) for index in range(6)], start=torch.randn(6, 3), held=held)
     slow = (ramp.T @ model.shots[:, 0]).item()
     with torch.no_grad():
         model.shots.add_(torch.randn(6, 3))

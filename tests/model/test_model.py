@@ -120,8 +120,7 @@ def test_a_fixed_camera_is_what_a_camera_is(batched):
 def test_a_camera_on_the_gpu_is_asked_once_until_it_is_written_to():
     pinholes, gpu = Pinholes(), torch.device("cuda")
     camera = Cameras(torch.eye(4)[None, :3], fx=100.0, fy=90.0, cx=50.0, cy=31.0, width=101, height=63)[0:1].to("cuda")
-    first = pinholes.of_full_size(camera, gpu)
-    assert pinholes.of_full_size(camera, gpu) is first
+    assert pinholes.of_full_size(camera, gpu) is pinholes.of_full_size(camera, gpu)
     camera.camera_to_worlds[0, 0, 3] = 7.0
     assert pinholes.of_full_size(camera, gpu).center.tolist() == [7.0, 0.0, 0.0]
 

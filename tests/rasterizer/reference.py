@@ -106,8 +106,7 @@ def project(
     longest = half_trace + (half_trace**2 - torch.linalg.det(blurred)).clamp(min=floor).sqrt()
     reach = 3.33 * variances.sqrt() if bounds == "rectangle" else 3 * longest.sqrt()[:, None].expand(-1, 2)
     sides, size = reach.ceil(), torch.tensor([width, height])
-    on_image = ((means2d + sides > 0) & (means2d - sides < size)).all(-1)
-    visible = in_range & on_image & (sides.amax(-1) > 0)
+    visible = in_range & ((means2d + sides > 0) & (means2d - sides < size)).all(-1) & (sides.amax(-1) > 0)
     return Screen(means2d, depths, torch.linalg.inv(blurred), compensations, condition, reach, visible)
 
 
