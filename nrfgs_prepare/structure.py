@@ -41,9 +41,9 @@ FEW = 30
 """Photographs up to which a single one that is not placed is worth another try with all pairs."""
 SEED = 0
 EXPLAINED = 0.6
-"""Minimum share of a photograph's matches that a right camera explains. In 18 models of six captures, right within 5 %
-of the cameras' mean distance, each of 285 photographs had at least 0.70 (by the tail's exponential fit two in ten
-thousand have below 0.6); in 12 of four captures, a camera off by half of it or more, the lowest had at most 0.47."""
+"""Minimum share of a photograph's matches that a right camera explains. In 15 models of six captures, right within 5 %
+of the cameras' mean distance, each photograph had at least 0.78; in nine of four captures, with a camera off by half of
+it or more, the lowest had at most 0.47 (results/prepare.json, `contradicted`)."""
 BYTES_PER_FEATURE = 300
 """Room for a feature and its matches in the database."""
 BYTES_PER_PIXEL = 1.0
