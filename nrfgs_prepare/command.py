@@ -12,7 +12,7 @@ import json
 import shlex
 import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -255,7 +255,6 @@ class Run:
             "mean_track_length": model.compute_mean_track_length(),
             "models": self.state["models"],
             "mapping": self.state["mapping"],
-            "doubtful": structure.doubtful_photographs(model, self.database),
             "pairs": len(json.loads(self.pairs_file.read_text())),
             "seconds_and_cpu_seconds": self.state["seconds"],
             "options": {name: value for name, value in asdict(self.options).items() if name not in ("photos", "out")},
@@ -268,23 +267,16 @@ class Run:
         command = shlex.join(["ns-train", "nrfgs", "--data", str(self.out)])
         for line in (
             f"{found}, mean reprojection error {error:.2f} px.",
-            *(f"- {advice}" for advice in self._advice(registered, total, error, shortest, numbers["doubtful"])),
+            *(f"- {advice}" for advice in self._advice(registered, total, error, shortest)),
             f"Train with: {command}",
         ):
             self.screen.print(line, markup=False, highlight=False, soft_wrap=True)
 
-    def _advice(
-        self, registered: int, total: int, error: float, shortest: float, doubtful: Sequence[str] = ()
-    ) -> Iterator[str]:
+    def _advice(self, registered: int, total: int, error: float, shortest: float) -> Iterator[str]:
         """Faults of a reconstruction and their fixes."""
         placed = {path.name for path in (self.out / "images").iterdir()}
         if left := [name for name in self.names if name not in placed]:
-            yield f"Without a camera: {_first(left)}. They are left out."
-        if doubtful:
-            yield (
-                f"Doubtful cameras, which their matches contradict: {_first(doubtful)}. Look at them and at those near "
-                "them in the viewer; take more photographs that overlap with them, or leave them out."
-            )
+            yield f"Without a camera: {', '.join(left[:5])}{' ...' if len(left) > 5 else ''}. They are left out."
         if registered < GOOD_SHARE * total:
             if self.state["models"] > 1:
                 yield f"They fall into {self.state['models']} groups; the largest is used. Take some in between."
@@ -296,7 +288,3 @@ class Run:
         if shortest < SHORTEST:
             found = f"A focal length is {shortest:.2f} of the longer side, shorter than that of most lenses"
             yield f"{found}: the cameras are probably wrong. Keep the photographs' EXIF, or take more, from the sides."
-
-
-def _first(names: Sequence[str]) -> str:
-    return f"{', '.join(names[:5])}{' ...' if len(names) > 5 else ''}"

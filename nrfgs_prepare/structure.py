@@ -196,39 +196,30 @@ def find_cameras(
 
     If few photographs are not all placed, all pairs are matched, with doubtful matches, too. Incremental mapping begins
     with two photographs from well separated places that share much, which a walk straight ahead lacks. If it places
-    fewer than `enough` photographs, global mapping, which solves for all positions at once, is tried, too. The first
-    model with most photographs wins, where those that their matches contradict do not count: global mapping of few
-    photographs often places all of them, and most wrongly.
+    fewer than `enough` photographs, global mapping, which solves for all positions at once, is tried, too; of few
+    photographs, which it mostly places wrongly, only if there is no other model. The first model with most photographs
+    wins, without those whose matches contradict it.
     """
     shutil.rmtree(folder, ignore_errors=True)
-    models, mapping = _map_incrementally(database, photos, folder, advance), "incremental"
-    placed = _placed(models, database)
-    if placed < len(names) <= FEW:
+
+    def trusted(models: list[Any]) -> list[Any]:
+        return [model for model in models if _leave_out_contradicted(model, database)]
+
+    models, mapping = trusted(_map_incrementally(database, photos, folder, advance)), "incremental"
+    if (placed := _size(models)[0]) < len(names) <= FEW:
         say(f"{placed} of {len(names)} photographs are placed. Trying again with more matches, for minutes.")
         with tempfile.TemporaryDirectory(dir=folder.parent) as place:
-            others = _map_incrementally(_match_more(database, names, Path(place)), photos, folder, lambda _: None)
-        if _placed(others, database) > placed:
+            more = _match_more(database, names, Path(place))
+            others = trusted(_map_incrementally(more, photos, folder, lambda _: None))
+        if _size(others)[0] > placed:
             models, mapping = others, "doubtful matches"
-    placed = _placed(models, database)
-    if placed < enough:
-        others = _map_globally(database, photos, folder)
-        if _placed(others, database) > placed:
+    if _size(models)[0] < enough and (len(names) > FEW or not models):
+        others = trusted(_map_globally(database, photos, folder))
+        if _size(others)[0] > _size(models)[0]:
             models, mapping = others, "global"
-    if _placed(models, database) < SMALLEST_MODEL:
-        return 0, mapping
-    write_model(max(models, key=lambda model: (_placed([model], database), model.num_points3D())), folder)
+    if models:
+        write_model(max(models, key=lambda model: _size([model])), folder)
     return len(models), mapping
-
-
-def _placed(models: list[Any], database: Path) -> int:
-    """Photographs of the largest model, without those that their matches contradict; a model of which these are half or
-    more counts as none."""
-    counts = [0]
-    for model in models:
-        doubtful = len(doubtful_photographs(model, database))
-        certain = model.num_reg_images() - doubtful
-        counts.append(certain if certain > doubtful else 0)
-    return max(counts)
 
 
 def _match_more(database: Path, names: list[str], place: Path) -> Path:
@@ -259,13 +250,20 @@ def _check_model(folder: Path, model: Any) -> None:
         written = len(read_model(folder)[1]), len(read_points(folder)[0])
     except InputError:
         written = None
-    if written != (model.num_reg_images(), model.num_points3D()):
+    if written != _size([model]):
         raise InputError(f"{folder} {CUT}")
+
+
+def _size(models: list[Any]) -> tuple[int, int]:
+    """Photographs and points of the largest model."""
+    return max(((model.num_reg_images(), model.num_points3D()) for model in models), default=(0, 0))
 
 
 def _map_incrementally(database: Path, photos: Path, folder: Path, advance: Advance) -> list[Any]:
     pycolmap = colmap()
-    options = pycolmap.IncrementalPipelineOptions(min_model_size=SMALLEST_MODEL, random_seed=SEED)
+    with pycolmap.Database.open(database) as opened:
+        threads = 1 if opened.num_images() <= FEW else -1  # few: the same result each time, in the same time
+    options = pycolmap.IncrementalPipelineOptions(min_model_size=SMALLEST_MODEL, random_seed=SEED, num_threads=threads)
     with tempfile.TemporaryDirectory(dir=folder.parent) as attempts:
         models = pycolmap.incremental_mapping(
             database,
@@ -297,9 +295,18 @@ def _map_globally(database: Path, photos: Path, folder: Path) -> list[Any]:
     return [model for model in models if model.num_points3D() >= FEWEST_POINTS * model.num_reg_images()]
 
 
-def doubtful_photographs(model: Any, database: Path) -> list[str]:
-    """Sorted names of placed photographs whose cameras explain less than EXPLAINED of their verified matches with other
-    placed ones: Sampson's distance is within the tolerance of the verification."""
+def _leave_out_contradicted(model: Any, database: Path) -> bool:
+    """Leave out photographs whose matches contradict their cameras, one after the other; whether more than half, and
+    enough, remain."""
+    placed = model.num_reg_images()
+    while (number := _contradicted(model, database)) is not None:
+        model.deregister_frame(model.images[number].frame_id)
+    return model.num_reg_images() > max(placed / 2, SMALLEST_MODEL - 1)
+
+
+def _contradicted(model: Any, database: Path) -> int | None:
+    """Number of the placed photograph whose camera explains the smallest share of its verified matches with other
+    placed ones, below EXPLAINED: Sampson's distance is within the tolerance of the verification."""
     pycolmap = colmap()
     tolerance = pycolmap.TwoViewGeometryOptions().ransac.max_error  # pixels
     images = {number: model.images[number] for number in model.reg_image_ids()}
@@ -320,10 +327,12 @@ def doubtful_photographs(model: Any, database: Path) -> list[str]:
             focal = (a.camera.mean_focal_length() + b.camera.mean_focal_length()) / 2
             slope = np.linalg.norm(np.hstack([lines[:, :2], back[:, :2]]), axis=1)  # 0 where both are at one place
             close = int((focal * np.abs((lines * y).sum(axis=1)) <= tolerance * slope).sum())
-            for number in numbers:
+            for number in numbers if len(matches) else ():
                 every[number] += len(matches)
                 explained[number] += close
-    return sorted(images[number].name for number in images if explained[number] < EXPLAINED * every[number])
+    shares = {number: explained[number] / every[number] for number in every}
+    worst = min(shares, key=shares.get, default=None)
+    return worst if worst is not None and shares[worst] < EXPLAINED else None
 
 
 def undistort(model: Path, photos: Path, folder: Path, advance: Advance) -> None:

@@ -91,13 +91,12 @@ def float32_tolerance(num_bands: int = 3) -> float:
 
 
 def round_to(kind: str, x: Tensor) -> Tensor:
-    """What a factor of a product is rounded to, in x's own dtype."""
+    """What a factor of a product is rounded to, in x's own dtype; tf32 keeps 10 bits of mantissa."""
     if kind == "bf16":
         return x.to(torch.bfloat16).to(x.dtype)
     if kind == "fp16":
         return x.clamp(-65504, 65504).half().to(x.dtype)
-    bits = (x.float().view(torch.int32) + 0x1000) & -0x2000  # tf32 keeps 10 bits of mantissa
-    return bits.view(torch.float32).to(x.dtype)
+    return ((x.float().view(torch.int32) + 0x1000) & -0x2000).view(torch.float32).to(x.dtype)
 
 
 class RoundedLinear(torch.autograd.Function):

@@ -110,9 +110,8 @@ def test_gain_leads_from_the_base_to_the_trained_image_and_beyond(scene):
     view = model.project(camera)
     base, trained = model.field.base_of(view), model.field.seen_from(view)
     colors, opacities = 2 * trained.colors - base.colors, 2 * trained.opacities - base.opacities
-    doubled = SplatAppearance(colors.clamp_min(0), opacities.clamp(0, 1))
+    by_hand = model.composite(view, SplatAppearance(colors.clamp_min(0), opacities.clamp(0, 1)))[0]["rgb"]
     # The same to rounding: 2^-24 in each of at most 300 splats that a pixel adds up.
-    by_hand = model.composite(view, doubled)[0]["rgb"]
     assert_close(picture(model, camera, PictureOptions(gain=2.0))["rgb"], by_hand, rtol=0, atol=300 * 2**-24)
 
 
