@@ -262,7 +262,7 @@ def _size(models: list[Any]) -> tuple[int, int]:
 def _map_incrementally(database: Path, photos: Path, folder: Path, advance: Advance) -> list[Any]:
     pycolmap = colmap()
     with pycolmap.Database.open(database) as opened:
-        threads = 1 if opened.num_images() <= FEW else -1  # few: the same result each time, in the same time
+        threads = 1 if opened.num_images() <= FEW else -1  # few: runs differ less, and take no longer
     options = pycolmap.IncrementalPipelineOptions(min_model_size=SMALLEST_MODEL, random_seed=SEED, num_threads=threads)
     with tempfile.TemporaryDirectory(dir=folder.parent) as attempts:
         models = pycolmap.incremental_mapping(
