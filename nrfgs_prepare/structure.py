@@ -38,7 +38,7 @@ RATIO, DOUBTFUL = 0.8, 0.9
 """Largest distance of a feature's best match, in distances of its second best: usually, and of few photographs that are
 not all placed otherwise."""
 FEW = 30
-"""Photographs up to which a single one that is not placed is worth another try with all pairs."""
+"""Few photographs: one that is not placed is worth another try with all pairs, and global mapping is mostly wrong."""
 SEED = 0
 EXPLAINED = 0.6
 """Minimum share of a photograph's matches that a right camera explains. In 15 models of six captures, right within 5 %
@@ -296,43 +296,49 @@ def _map_globally(database: Path, photos: Path, folder: Path) -> list[Any]:
 
 
 def _leave_out_contradicted(model: Any, database: Path) -> bool:
-    """Leave out photographs whose matches contradict their cameras, one after the other; whether more than half, and
-    enough, remain."""
+    """Leave out photographs whose cameras explain less than EXPLAINED of their matches, the worst one first, until none
+    is left; whether more than half, and enough, remain."""
+    pairs = _explained_matches(model, database)
     placed = model.num_reg_images()
-    while (number := _contradicted(model, database)) is not None:
-        model.deregister_frame(model.images[number].frame_id)
+    while pairs:
+        every, explained = Counter(), Counter()
+        for pair, (matches, close) in pairs.items():
+            every.update(dict.fromkeys(pair, matches))
+            explained.update(dict.fromkeys(pair, close))
+        worst = min(every, key=lambda number: explained[number] / every[number])
+        if explained[worst] >= EXPLAINED * every[worst]:
+            break
+        model.deregister_frame(model.images[worst].frame_id)
+        pairs = {pair: counts for pair, counts in pairs.items() if worst not in pair}
     return model.num_reg_images() > max(placed / 2, SMALLEST_MODEL - 1)
 
 
-def _contradicted(model: Any, database: Path) -> int | None:
-    """Number of the placed photograph whose camera explains the smallest share of its verified matches with other
-    placed ones, below EXPLAINED: Sampson's distance is within the tolerance of the verification."""
+def _explained_matches(model: Any, database: Path) -> dict[tuple[int, int], tuple[int, int]]:
+    """Verified matches of each pair of placed photographs that has some, and how many the cameras explain: Sampson's
+    distance is within the tolerance of the verification."""
     pycolmap = colmap()
     tolerance = pycolmap.TwoViewGeometryOptions().ransac.max_error  # pixels
     images = {number: model.images[number] for number in model.reg_image_ids()}
-    rays, every, explained = {}, Counter(), Counter()
+    rays, pairs = {}, {}
     with pycolmap.Database.open(database) as opened:
         for number, image in images.items():
             keypoints = np.asarray(opened.read_keypoints(number), dtype=np.float64)[:, :2]
             rays[number] = np.pad(image.camera.cam_from_img(keypoints), ((0, 0), (0, 1)), constant_values=1.0)
         for pair, geometry in zip(*opened.read_two_view_geometries(), strict=True):
-            numbers = pycolmap.pair_id_to_image_pair(pair)
-            if not all(number in images for number in numbers):
+            first, second = numbers = pycolmap.pair_id_to_image_pair(pair)
+            matches = np.asarray(geometry.inlier_matches).reshape(-1, 2)
+            if first not in images or second not in images or len(matches) == 0:
                 continue
-            (a, b), matches = (images[number] for number in numbers), np.asarray(geometry.inlier_matches).reshape(-1, 2)
+            a, b = images[first], images[second]
             relative = b.cam_from_world() * a.cam_from_world().inverse()
             essential = np.cross(relative.translation, relative.rotation.matrix(), axisb=0).T  # [t]x R
-            x, y = (rays[number][matches[:, i]] for i, number in enumerate(numbers))
+            x, y = rays[first][matches[:, 0]], rays[second][matches[:, 1]]
             lines, back = x @ essential.T, y @ essential
             focal = (a.camera.mean_focal_length() + b.camera.mean_focal_length()) / 2
             slope = np.linalg.norm(np.hstack([lines[:, :2], back[:, :2]]), axis=1)  # 0 where both are at one place
-            close = int((focal * np.abs((lines * y).sum(axis=1)) <= tolerance * slope).sum())
-            for number in numbers if len(matches) else ():
-                every[number] += len(matches)
-                explained[number] += close
-    shares = {number: explained[number] / every[number] for number in every}
-    worst = min(shares, key=shares.get, default=None)
-    return worst if worst is not None and shares[worst] < EXPLAINED else None
+            close = focal * np.abs((lines * y).sum(axis=1)) <= tolerance * slope
+            pairs[tuple(numbers)] = len(matches), int(close.sum())
+    return pairs
 
 
 def undistort(model: Path, photos: Path, folder: Path, advance: Advance) -> None:

@@ -56,7 +56,7 @@ class NrfgsTrainerConfig(TrainerConfig):
     def __post_init__(self) -> None:
         file = self.load_config  # all that ns-train takes, if it is given
         if file and (not file.is_file() or self.load_dir or self.load_checkpoint or self.data):
-            raise InputError(f"--load-config {file} trains anew, as that file says: name one, and no other option.")
+            raise InputError(f"--load-config {file}: name an existing config.yml, and no other option: it trains anew.")
 
     def setup(self, **kwargs) -> Trainer:
         """The trainer, for several devices the one that spreads the splats over them; InputError as `check`."""
