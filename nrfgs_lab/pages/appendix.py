@@ -93,6 +93,13 @@ def trial_changes(sitting: str, best: int | None = None, only: str = "") -> str:
     return "; ".join(texts)
 
 
+def best_rate(head: str) -> str:
+    """Mean change by the best learning rate of the splats' values, and by the same rate on other held-out views."""
+    suffix = "" if head == "field" else f" of {head}"
+    best, other = trial_changes(f"geometry{suffix}", best=1), trial_changes(f"ridge{suffix}", only="scales twice")
+    return f"{best}, on other views {other}"
+
+
 def watched() -> str:
     """Mean change by the threshold that is best on a set of held-out views, on the capture's other set."""
     runs, changes = defaultdict(dict), []
@@ -134,10 +141,7 @@ BLOCKS = {
     "tables.spread": lambda: trial_changes("spread", best=2),
     "tables.narrow": lambda: trial_changes("narrow"),
     "tables.watched": watched,
-    "tables.geometry": lambda: trial_changes("geometry", best=1),
-    "tables.geometry_of_harmonics": lambda: trial_changes("geometry of harmonics", best=1),
-    "tables.ridge": lambda: trial_changes("ridge", only="scales twice"),
-    "tables.ridge_of_harmonics": lambda: trial_changes("ridge of harmonics", only="scales twice"),
+    "tables.geometry": best_rate,
     "tables.heads": lambda: changes(HEADS),
     "tables.scale": scale,
 }

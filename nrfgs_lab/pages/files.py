@@ -28,10 +28,10 @@ def losses() -> str:
     """Loss of a PLY file against each model; beside it, harmonics that were trained themselves."""
     body = []
     for scene, one in plies().items():
-        cost = f"{one['splats']:,}", f"{one['bytes'] / 1e6:.1f}", f"{one['seconds']['fit']:.0f}"
+        cost = f"{one['splats']:,}", f"{one['bytes'] / 1e6:.1f}"
         psnr = *(one[f"psnr_{part}"] for part in ("model", "file", "on_screen")), mean(today(scene, SAME), "psnr")
         body.append([scene, *cost, *map("{:.2f}".format, psnr)])
-    return grid(["", "splats", "MB", "seconds", "model", "file", "in Spark", "harmonics, trained"], body)
+    return grid(["", "splats", "MB", "model", "file", "in Spark", "harmonics, trained"], body)
 
 
 BLOCKS = {"export.losses": losses, "export.worst": lambda: f"{max(one['loss_db'] for one in plies().values()):.1f}"}

@@ -27,21 +27,21 @@ APPEARANCE = "pipeline.model.appearance."
 
 INTRODUCTION = """# Options
 
-**This page explains the options that this package adds, with `nrfgs`'s defaults. `ns-train METHOD --help` lists all.**
-`nrfgs-sh`, `nrfgs-vdgs`, `nrfgs-gsnb` and `nrfgs-sg` turn off `view-noise`, `few-views`, `shrinkage`, `dense-start` and
-`near-plane`, and have splatfacto's densification and 30,000 steps without averaging. Cameras lie within [-1, 1] scene
-units.
+**This page explains the options that this package adds, with `nrfgs`'s defaults. `ns-train METHOD --help` lists all,
+also learning rates.** `nrfgs-sh`, `nrfgs-vdgs`, `nrfgs-gsnb` and `nrfgs-sg` turn off `view-noise`, `few-views`,
+`shrinkage`, `dense-start` and `near-plane`. They have splatfacto's densification and 30,000 steps without averaging.
+Cameras lie within [-1, 1] scene units.
 """
 SPLATFACTOS = {field.name for field in dataclasses.fields(SplatfactoModelConfig)}
 """Options of splatfacto's model, not explained here."""
 LEFT_OUT = (
     *("logging.local-writer.enable", "pipeline.datamanager.cache-images-type", "pipeline.sharding.rebalance-at"),
-    *(APPEARANCE + name for name in ("distance-eps", "implementation", "precision")),
-    *("load-3D-points", "viewer.websocket-host", "pipeline.datamanager.image-memory", "pipeline.compact"),
+    *(APPEARANCE + name for name in ("distance-eps", "implementation", "precision", "output-init", "opacity-bound")),
+    *("load-3D-points", "eval-mode", "viewer.websocket-host", "pipeline.datamanager.image-memory", "pipeline.compact"),
     MODEL + "warmup-steps",
 )
 """Options that few need, or that another page explains: `--help` has them."""
-HOST = "`--help` lists learning rates, `--optimizers.NAME.optimizer.lr` to `.scheduler.lr-final`.\n"
+HOST = "`ns-train --help` explains the other methods, `nrfgs --help` the other commands.\n"
 
 
 class Option(NamedTuple):
@@ -101,8 +101,7 @@ def methods() -> list[MethodSpecification]:
 
 
 def page() -> str:
-    first, *others = methods()
-    options = [option for option in own_options(first.config) if option.flag not in LEFT_OUT]
+    options = [option for option in own_options(methods()[0].config) if option.flag not in LEFT_OUT]
     heads = [option for option in options if option.flag.startswith(APPEARANCE)]
     model = [option for option in options if option.flag.startswith(MODEL) and option not in heads]
     rest = [option._replace(flag=f"--{option.flag}") for option in options if not option.flag.startswith(MODEL)]
@@ -118,10 +117,8 @@ def page() -> str:
         "## Training and data\n\n`nrfgs-data` and what follows it come last in a command.\n",
         listed([option for option in rest if ".dataparser." not in option.flag] + data),
         HOST,
-        f"`ns-train --help` explains the other methods: {', '.join(f'`{one.config.method_name}`' for one in others)}.",
-        "`nrfgs --help` lists the other commands.",
     ]
-    return "\n".join(parts) + "\n"
+    return "\n".join(parts)
 
 
 def strategies() -> str:

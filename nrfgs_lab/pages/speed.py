@@ -38,10 +38,4 @@ def scale_fit(column: str, factor: str, unit: str, renderer: str) -> str:
     return f"{parts[0]:.1f} {unit}, {parts[1]:.1f} for each million splats and {parts[2]:.2f} for each megapixel"
 
 
-def lists() -> str:
-    """Least and most that lists split into small tiles have of large tiles' time at 8 megapixels."""
-    sizes = [one for name, one in records("tests")["lists"].items() if name.endswith("/3464 x 2309")]
-    return span([one["split"]["all"] / one["direct"]["all"] for one in sizes], "{:.2f}".format)
-
-
-BLOCKS = {"speed.scale_fit": scale_fit, "speed.scale_ratios": scale_ratios, "speed.lists": lists}
+BLOCKS = {"speed.scale_fit": scale_fit, "speed.scale_ratios": scale_ratios}
