@@ -143,7 +143,8 @@ class TimedPace(Pace):
         if len(self._durations) >= STEPS_BEFORE_PLANNING:
             step = self.step_seconds
             # The schedules' last position is for the last step, not for one behind it.
-            self.rate = max(step / max(self.seconds - self.elapsed, step) * self._cost_ahead(), 1e-9)
+            seconds_left = max(self.seconds - self.elapsed, step)
+            self.rate = max(step / seconds_left * self._cost_ahead(), 1e-9)
         super().advance()
 
     def _cost_ahead(self) -> float:

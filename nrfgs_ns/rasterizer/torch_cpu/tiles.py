@@ -269,7 +269,8 @@ class Canvas:
     def centres(self, tiles: Tensor) -> Tensor:
         """Centres x, y of tiles in pixels, y counted from the top of the first image. [L] -> [2, L, 1], float64"""
         tiles_x = self.footprints.tiles_x
-        return (torch.stack([tiles % tiles_x, tiles // tiles_x])[..., None].double() + 0.5) * SUB_TILE
+        columns_rows = torch.stack([tiles % tiles_x, tiles // tiles_x])[..., None]
+        return (columns_rows.double() + 0.5) * SUB_TILE
 
     def image(self, values: Tensor, n_cameras: int, width: int, height: int) -> Tensor:
         """Put tiles back into images. [C * tiles, D, P] -> [C, H, W, D]"""
