@@ -44,39 +44,40 @@ def _direction(directions, at, valid):
 def _harmonic(index: tl.constexpr, x, y, z):
     """One harmonic at a unit direction, and its slopes by x, y and z."""
     zero = 0.0 * x
-    value, by_x, by_y, by_z = zero + C0, zero, zero, zero
+    value, slope_x, slope_y, slope_z = zero + C0, zero, zero, zero
     if index == 1:
-        value, by_y = y * -C1, zero - C1
+        value, slope_y = y * -C1, zero - C1
     elif index == 2:
-        value, by_z = z * C1, zero + C1
+        value, slope_z = z * C1, zero + C1
     elif index == 3:
-        value, by_x = x * -C1, zero - C1
+        value, slope_x = x * -C1, zero - C1
     elif index == 4:
-        value, by_x, by_y = x * y * C2, y * C2, x * C2
+        value, slope_x, slope_y = x * y * C2, y * C2, x * C2
     elif index == 5:
-        value, by_y, by_z = y * z * -C2, z * -C2, y * -C2
+        value, slope_y, slope_z = y * z * -C2, z * -C2, y * -C2
     elif index == 6:
-        value, by_z = (3.0 * z * z - 1.0) * C2Z, 6.0 * z * C2Z
+        value, slope_z = (3.0 * z * z - 1.0) * C2Z, 6.0 * z * C2Z
     elif index == 7:
-        value, by_x, by_z = x * z * -C2, z * -C2, x * -C2
+        value, slope_x, slope_z = x * z * -C2, z * -C2, x * -C2
     elif index == 8:
-        value, by_x, by_y = 0.5 * (x * x - y * y) * C2, x * C2, y * -C2
+        value, slope_x, slope_y = 0.5 * (x * x - y * y) * C2, x * C2, y * -C2
     elif index == 9:
-        value, by_x, by_y = y * (y * y - 3.0 * x * x) * C3, -6.0 * x * y * C3, 3.0 * (y * y - x * x) * C3
+        value, slope_x, slope_y = y * (y * y - 3.0 * x * x) * C3, -6.0 * x * y * C3, 3.0 * (y * y - x * x) * C3
     elif index == 10:
-        value, by_x, by_y, by_z = 2.0 * x * y * z * C3Z, 2.0 * y * z * C3Z, 2.0 * x * z * C3Z, 2.0 * x * y * C3Z
+        value, slope_x = 2.0 * x * y * z * C3Z, 2.0 * y * z * C3Z
+        slope_y, slope_z = 2.0 * x * z * C3Z, 2.0 * x * y * C3Z
     elif index == 11:
-        value, by_y, by_z = y * (1.0 - 5.0 * z * z) * C3ZZ, (1.0 - 5.0 * z * z) * C3ZZ, -10.0 * y * z * C3ZZ
+        value, slope_y, slope_z = y * (1.0 - 5.0 * z * z) * C3ZZ, (1.0 - 5.0 * z * z) * C3ZZ, -10.0 * y * z * C3ZZ
     elif index == 12:
-        value, by_z = z * (5.0 * z * z - 3.0) * C3ZZZ, (15.0 * z * z - 3.0) * C3ZZZ
+        value, slope_z = z * (5.0 * z * z - 3.0) * C3ZZZ, (15.0 * z * z - 3.0) * C3ZZZ
     elif index == 13:
-        value, by_x, by_z = x * (1.0 - 5.0 * z * z) * C3ZZ, (1.0 - 5.0 * z * z) * C3ZZ, -10.0 * x * z * C3ZZ
+        value, slope_x, slope_z = x * (1.0 - 5.0 * z * z) * C3ZZ, (1.0 - 5.0 * z * z) * C3ZZ, -10.0 * x * z * C3ZZ
     elif index == 14:
-        value, by_z = z * (x * x - y * y) * C3Z, (x * x - y * y) * C3Z
-        by_x, by_y = 2.0 * x * z * C3Z, -2.0 * y * z * C3Z
+        value, slope_z = z * (x * x - y * y) * C3Z, (x * x - y * y) * C3Z
+        slope_x, slope_y = 2.0 * x * z * C3Z, -2.0 * y * z * C3Z
     elif index == 15:
-        value, by_x, by_y = x * (3.0 * y * y - x * x) * C3, 3.0 * (y * y - x * x) * C3, 6.0 * x * y * C3
-    return value, by_x, by_y, by_z
+        value, slope_x, slope_y = x * (3.0 * y * y - x * x) * C3, 3.0 * (y * y - x * x) * C3, 6.0 * x * y * C3
+    return value, slope_x, slope_y, slope_z
 
 
 @triton.jit(do_not_specialize=["count"])
@@ -116,13 +117,13 @@ def backward_kernel(
         own, d_own = coefficients + at * (3 * BASES) + 3 * index, d_coefficients + at * (3 * BASES) + 3 * index
         value = tl.zeros((BLOCK,), tl.float32)
         if index < USED:
-            value, by_x, by_y, by_z = _harmonic(index, x, y, z)
-            slope = red * tl.load(own, mask=valid, other=0.0)
-            slope += green * tl.load(own + 1, mask=valid, other=0.0)
-            slope += blue * tl.load(own + 2, mask=valid, other=0.0)
-            d_x += slope * by_x
-            d_y += slope * by_y
-            d_z += slope * by_z
+            value, slope_x, slope_y, slope_z = _harmonic(index, x, y, z)
+            d_value = red * tl.load(own, mask=valid, other=0.0)
+            d_value += green * tl.load(own + 1, mask=valid, other=0.0)
+            d_value += blue * tl.load(own + 2, mask=valid, other=0.0)
+            d_x += d_value * slope_x
+            d_y += d_value * slope_y
+            d_z += d_value * slope_z
         tl.store(d_own, value * red, mask=valid)
         tl.store(d_own + 1, value * green, mask=valid)
         tl.store(d_own + 2, value * blue, mask=valid)

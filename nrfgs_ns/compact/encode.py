@@ -68,7 +68,8 @@ def encode(
     """
     tables = tables_of(drawable(field.splats))
     tables["opacities"] = tables["opacities"].clamp(-LARGEST_LOGIT, LARGEST_LOGIT)
-    steps = {name: coarser * step for name, step in (steps_of(tables) if steps is None else steps).items()}
+    steps = steps_of(tables) if steps is None else steps
+    steps = {name: coarser * step for name, step in steps.items()}
     needed = np.ptp(tables["means"].cpu().numpy(), axis=0) / (2**MOST_BITS - 1)
     if (needed > steps["means"]).any():
         warn(
@@ -79,15 +80,17 @@ def encode(
     grids, codes = {}, {}
     for name, table in tables.items():
         values = table.cpu().numpy()
-        grids[name] = Grid(values.min(axis=0) if name == "means" else np.zeros(values.shape[1]), steps[name])
+        low = values.min(axis=0) if name == "means" else np.zeros(values.shape[1])
+        grids[name] = Grid(low, steps[name])
         codes[name] = grids[name].codes(values).clip(-LARGEST_CODE, LARGEST_CODE)
 
     places = morton(codes["means"])
     order = np.argsort(places, kind="stable")
     differences = np.diff(places[order], prepend=np.uint64(0))
+    upper, lower = differences >> np.uint64(32), differences & np.uint64(0xFFFFFFFF)
     splats = np.concatenate([codes[name] for name in COLUMNS], axis=1)
     streams: dict[str, np.ndarray | Table] = {
-        "means": Table(np.stack([differences >> np.uint64(32), differences & np.uint64(0xFFFFFFFF)]), signed=False),
+        "means": Table(np.stack([upper, lower]), signed=False),
         "splats": Table(splats[order].T),
         "latents": Table(codes["latents"][order].T),
     }

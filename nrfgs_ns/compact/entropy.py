@@ -248,7 +248,8 @@ def _coded(
             fs = f[step, :count]
             x = push(x, limits[step, :count])
             quotient = x // fs
-            state[:count] = (quotient << np.uint64(PRECISION)) + (x - quotient * fs) + start[step, :count]
+            x = (quotient << np.uint64(PRECISION)) + (x - quotient * fs) + start[step, :count]
+            state[:count] = x
     return state.astype("<u4").tobytes() + b"".join(chunk.tobytes() for chunk in reversed(chunks))
 
 

@@ -5,8 +5,8 @@ The splats are a table, name -> parameter [N, ...]. Whatever a strategy does to 
 table, whichever head it belongs to, and to the optimisers' moments. The model never asks which strategy it has.
 
 On the command line a strategy is one word, its name and options of its own: `mcmc,budget=150000,refine_every=50`.
-`strategy.py` is the interface; `gradient.py`, `error_guided.py` and `mcmc.py` (with `relocation.py`) have the
-strategies, `statistics.py` what they share.
+`strategy.py` is the interface; `gradient.py`, `error_guided.py` and `mcmc.py` have the strategies, `statistics.py` what
+they share.
 """
 
 from dataclasses import fields

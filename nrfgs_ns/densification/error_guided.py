@@ -106,9 +106,7 @@ class ErrorGuidedDensification(Densification):
 
     # What a step shows.
 
-    @torch.no_grad()
-    def post_backward(self, step, info, splats, optimizers) -> None:
-        self.shown = None
+    def change_splats(self, step, info, splats, optimizers) -> None:
         if step >= self.stop:
             return
         self._update_statistics(step, info, len(splats["means"]))
@@ -122,8 +120,9 @@ class ErrorGuidedDensification(Densification):
         """Let the window's maxima be at least the step's; errors only while splats grow."""
         self.make_tables((ERROR, WIDTH, CHANGE), count, info["radii"].device)
         grows = step < self.grow_until
-        tables = Statistics(self.state[WIDTH], self.state[ERROR] if grows else None, self.state.get(CHANGE))
-        accumulate(tables, info, 1.0, info["means2d"].absgrad if grows else None, info.get("change"))
+        norms, gradients = (self.state[ERROR], info["means2d"].absgrad) if grows else (None, None)
+        tables = Statistics(self.state[WIDTH], norms, changes=self.state.get(CHANGE))
+        accumulate(tables, info, 1.0, gradients, info.get("change"))
 
     # What a refinement does.
 

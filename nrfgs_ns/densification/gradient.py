@@ -43,16 +43,15 @@ class GradientConfig(DensificationConfig):
         super().check()
         self.require(self.reset_alpha_every >= 1, "reset_alpha_every", "at least 1")
 
-    def _build(self, scene_unit: float | None, **thresholds: Any) -> "GradientDensification":
-        """A strategy by gsplat's rules with these thresholds, under the names of its `DefaultStrategy`."""
-        rules = PruneBySeenOpacity(
+    def _rules(self, **thresholds: Any) -> "PruneBySeenOpacity":
+        """Rules of gsplat with these thresholds, under the names of its `DefaultStrategy`."""
+        return PruneBySeenOpacity(
             refine_start_iter=self.warmup_length,
             refine_stop_iter=self.stop_split_at,
             refine_every=self.refine_every,
             reset_every=self.reset_alpha_every * self.refine_every,
             **thresholds,
         )
-        return GradientDensification(self, rules, scene_unit)
 
 
 @dataclass
@@ -74,8 +73,7 @@ class Splatfacto(GradientConfig):
             self.require(getattr(self, name, fixed) == fixed, name, f"{fixed}, its only value")
 
     def build(self, num_images: int, num_views: int, scene_unit: float) -> "GradientDensification":
-        return self._build(
-            scene_unit,
+        rules = self._rules(
             prune_opa=self.cull_alpha_thresh,
             grow_grad2d=self.densify_grad_thresh,
             grow_scale3d=0.01,  # in scene units, as the next: larger ones are split, not duplicated
@@ -86,6 +84,7 @@ class Splatfacto(GradientConfig):
             pause_refine_after_reset=num_images + self.refine_every,
             absgrad=True,
         )
+        return GradientDensification(self, rules, scene_unit)
 
 
 @dataclass
@@ -95,8 +94,7 @@ class Original(GradientConfig):
     name: ClassVar[str] = "original"
 
     def build(self, num_images: int, num_views: int, scene_unit: float) -> "GradientDensification":
-        return self._build(
-            None,
+        rules = self._rules(
             prune_opa=0.005,
             grow_grad2d=2e-4,
             grow_scale3d=0.01,  # in extents of the cameras, as the next
@@ -105,6 +103,7 @@ class Original(GradientConfig):
             pause_refine_after_reset=0,
             absgrad=False,
         )
+        return OriginalDensification(self, rules)
 
 
 class PruneBySeenOpacity(DefaultStrategy):
@@ -127,49 +126,41 @@ class PruneBySeenOpacity(DefaultStrategy):
 
 
 class GradientDensification(Densification):
-    """Growth where screen-space gradients are large, pruning and resetting of opacities: splatfacto's, and 3DGS's.
+    """Growth where screen-space gradients are large, pruning and resetting of opacities, as in splatfacto.
 
     Args:
         config: its options. `opacity_seen` is what pruning looks at; a reset always acts on the stored one.
         strategy: gsplat's own, with this one's thresholds.
-        scene_unit: world units in a scene unit, which sizes are measured in; None: as in 3DGS, in extents of the
-            cameras, and opacities are not reset at step 0, as gsplat 1.4 does: 3DGS counts its steps from 1.
+        scene_unit: world units in a scene unit, which sizes are measured in.
     """
 
-    def __init__(self, config: GradientConfig, strategy: PruneBySeenOpacity, scene_unit: float | None):
+    def __init__(self, config: GradientConfig, strategy: PruneBySeenOpacity, scene_unit: float = 1.0):
         super().__init__(config)
         self.strategy = strategy
         strategy.seen_opacity = self.seen_opacity
         self.gradients = "absolute" if strategy.absgrad else "signed"
         self.bounds = {name: getattr(strategy, name) for name in STRATEGY_BOUNDS}
-        self.measure_by_cameras = scene_unit is None
         self.threshold, self.widest = strategy.grow_grad2d, strategy.grow_scale2d
         if self.budget:
             self.state[THRESHOLD] = 0.0
-        self.state |= strategy.initialize_state(scene_scale=scene_unit or 1.0)
+        self.state |= strategy.initialize_state(scene_scale=scene_unit)
 
     def rests_at(self, step: int) -> bool:
         return step >= self.strategy.refine_stop_iter
 
     def begin(self, centers: Tensor, num_splats: int, pixels: int) -> None:
         self.pixels = pixels
-        if self.measure_by_cameras:
-            spread = (centers - centers.mean(dim=0)).norm(dim=-1).max().item()
-            self.state["scene_scale"] = EXTENT_MARGIN * spread or 1.0  # one camera has no extent
 
-    def post_backward(self, step, info, splats, optimizers) -> None:
-        self.shown = None
+    def change_splats(self, step, info, splats, optimizers) -> None:
         strategy = self.strategy
         self.take_changes(info, len(splats["means"]))
         if step < strategy.refine_stop_iter:
             self._update_statistics(info, len(splats["means"]))
-            if step == 0 and self.measure_by_cameras:
-                return
             if self._refines(step):
                 self._refine(step, info, splats, optimizers)
-            if step % strategy.reset_every == 0:
+            if self._resets(step):
                 reset_opa(splats, optimizers, self.state, value=2.0 * strategy.prune_opa)
-        if step % strategy.reset_every == 0 or self._refines(step):
+        if self._resets(step) or self._refines(step):
             self.begin_another_window()
 
     def _update_statistics(self, info: Mapping[str, Any], count: int) -> None:
@@ -178,7 +169,7 @@ class GradientDensification(Densification):
         means2d = info["means2d"]
         gradients = means2d.absgrad if self.strategy.absgrad else means2d.grad
         self.make_tables(("grad2d", "count", "radii"), count, gradients.device)
-        accumulate(Statistics(state.get("radii"), state["grad2d"], state["count"]), info, 2.0, gradients, sums=True)
+        accumulate(Statistics(state.get("radii"), state["grad2d"], state["count"]), info, 2.0, gradients)
 
     def _refine(self, step: int, info: Mapping[str, Any], splats, optimizers) -> None:
         """Grow and prune by gsplat's rules, and begin the statistics anew."""
@@ -236,3 +227,19 @@ class GradientDensification(Densification):
             and step % strategy.refine_every == 0
             and step % strategy.reset_every >= strategy.pause_refine_after_reset
         )
+
+    def _resets(self, step: int) -> bool:
+        """Whether opacities are reset at this step, while splats grow. gsplat 1.4 counts steps from 0."""
+        return step % self.strategy.reset_every == 0
+
+
+class OriginalDensification(GradientDensification):
+    """The same as in 3DGS: sizes are measured in extents of the cameras, and steps count from 1."""
+
+    def begin(self, centers: Tensor, num_splats: int, pixels: int) -> None:
+        super().begin(centers, num_splats, pixels)
+        spread = (centers - centers.mean(dim=0)).norm(dim=-1).max().item()
+        self.state["scene_scale"] = EXTENT_MARGIN * spread or 1.0  # one camera has no extent
+
+    def _resets(self, step: int) -> bool:
+        return step > 0 and super()._resets(step)

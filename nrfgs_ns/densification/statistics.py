@@ -21,9 +21,11 @@ class Statistics(NamedTuple):
     widths: Tensor | None
     """largest radii, in shares of the image's longer side"""
     norms: Tensor | None
-    """norms of screen-space gradients: their sum, or the largest"""
-    counts_or_changes: Tensor | None
-    """number of steps that have shown the splat (with sums of norms), or its largest change of opacity"""
+    """norms of screen-space gradients: their sum where steps are counted, otherwise the largest"""
+    counts: Tensor | None = None
+    """number of steps that have shown the splat"""
+    changes: Tensor | None = None
+    """largest changes of the splats' opacities (`strategy.change_of`)"""
 
 
 class Step(NamedTuple):
@@ -45,7 +47,6 @@ def accumulate(
     extent: float,
     gradients: Tensor | None,
     change: Tensor | None = None,
-    sums: bool = False,
 ) -> None:
     """Update the tables, in place, by a step. Norms that are not finite count as 0; changes that are NaN do not count.
 
@@ -54,8 +55,7 @@ def accumulate(
         info: the rasterizer's, of M rows; those of radius 0 belong to invisible splats.
         extent: width and height of the image in the units by which gradients are to be taken.
         gradients: the loss's gradients by the rows' centres in pixels, [M, 2].
-        change: changes of the rows' opacities (`strategy.change_of`), [M].
-        sums: add up norms and count steps, instead of keeping the largest norms and changes.
+        change: changes of the rows' opacities, [M].
     """
     width, height, cameras = info["width"], info["height"], info["n_cameras"]
     scales = width / extent * cameras, height / extent * cameras
@@ -69,23 +69,23 @@ def accumulate(
         and try_kernel(tensors[0].device)
     ):
         from nrfgs_ns.densification.statistics_triton import in_triton as update
-    update(tables, step, gradients, change, sums)
+    update(tables, step, gradients, change)
 
 
-def in_torch(tables: Statistics, step: Step, gradients: Tensor | None, change: Tensor | None, sums: bool) -> None:
+def in_torch(tables: Statistics, step: Step, gradients: Tensor | None, change: Tensor | None) -> None:
     """`accumulate` in PyTorch, the kernel's twin."""
-    (widths, norms, counts_or_changes), (rows, radii, side, scales) = tables, step
+    (widths, norms, counts, changes), (rows, radii, side, scales) = tables, step
     seen = radii > 0
     if widths is not None:
         widths.scatter_reduce_(0, rows, radii / side, "amax")
     if norms is not None:
         x, y = gradients.unbind(dim=-1)
         norm = torch.hypot(x * scales[0], y * scales[1]).nan_to_num(0.0, 0.0) * seen
-        norms.scatter_reduce_(0, rows, norm, "sum" if sums else "amax")
-    if counts_or_changes is not None and sums:
-        counts_or_changes.index_add_(0, rows, seen.to(counts_or_changes.dtype))
-    elif counts_or_changes is not None:
-        counts_or_changes.scatter_reduce_(0, rows, change.where(seen & ~change.isnan(), -math.inf), "amax")
+        norms.scatter_reduce_(0, rows, norm, "amax" if counts is None else "sum")
+    if counts is not None:
+        counts.index_add_(0, rows, seen.to(counts.dtype))
+    if changes is not None:
+        changes.scatter_reduce_(0, rows, change.where(seen & ~change.isnan(), -math.inf), "amax")
 
 
 @tried_once("What densification remembers")
@@ -95,6 +95,6 @@ def try_kernel(device: torch.device) -> None:
 
     one, gradient = torch.ones(1, device=device), torch.ones(1, 2, device=device)
     step = Step(torch.zeros(1, dtype=torch.int64, device=device), one.int(), 1.0, (1.0, 1.0))
-    in_triton(Statistics(one, one.clone(), one.clone()), step, gradient, None, True)
+    in_triton(Statistics(one, one.clone(), counts=one.clone()), step, gradient, None)
     for norms in (one.clone(), None):  # while splats grow, and after it
-        in_triton(Statistics(one, norms, one.clone()), step, gradient, one, False)
+        in_triton(Statistics(one, norms, changes=one.clone()), step, gradient, one)

@@ -205,9 +205,15 @@ class Densification(ABC):
             changes = change_of(stored, opacities.detach().to(stored.dtype))
             info["change"] = torch.where(info["radii"] > 0, changes, UNSEEN)
 
-    @abstractmethod
+    @torch.no_grad()
     def post_backward(self, step: int, info: Mapping[str, Any], splats: Splats, optimizers: Optimizers) -> None:
         """Change the table after the optimisers' step, given the `info` of `pre_backward` with gradients."""
+        self.shown = None
+        self.change_splats(step, info, splats, optimizers)
+
+    @abstractmethod
+    def change_splats(self, step: int, info: Mapping[str, Any], splats: Splats, optimizers: Optimizers) -> None:
+        """The strategy's own part of `post_backward`, without gradients."""
 
     def make_tables(self, names: Iterable[str], count: int, device: torch.device) -> None:
         """Make the named statistics of splats that the state lacks yet."""

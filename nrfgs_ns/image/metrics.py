@@ -86,7 +86,8 @@ def ms_ssim(pred: Tensor, gt: Tensor, mask: Tensor | None = None) -> float | Non
     product = torch.ones(3, dtype=gt.dtype, device=gt.device)
     for scale, weight in enumerate(MS_SSIM_WEIGHTS, start=1):
         ssim_map, cs_map = ssim_maps(pred, gt)
-        per_channel = _mean_over_centres(ssim_map if scale == len(MS_SSIM_WEIGHTS) else cs_map, mask)
+        coarsest = scale == len(MS_SSIM_WEIGHTS)
+        per_channel = _mean_over_centres(ssim_map if coarsest else cs_map, mask)
         if per_channel is None:
             return None
         product = product * per_channel.relu() ** weight

@@ -21,7 +21,7 @@ USUAL = 5.0
 WINDOW = 3
 """Side of the square around a pixel, in pixels."""
 PATCH, MOST_KEPT = 0.04, 0.6
-"""Side of the patch around a pixel, as a share of the image's longer side; largest share of it that is kept."""
+"""Side of the patch around a pixel, in longer sides of the image; share of it above which the pixel is kept."""
 FIRST_STEP = 500
 """First step at which pixels are trimmed."""
 FADE_STEPS = 1500
@@ -58,11 +58,13 @@ class Trimming(nn.Module):
         kept = torch.maximum(kept, (_mean_around(kept, WINDOW) > 0.5).to(kept.dtype))
         patch = 2 * round(PATCH * max(error.shape) / 2) + 1
         kept = torch.maximum(kept, (_mean_around(kept, patch) > MOST_KEPT).to(kept.dtype))[..., None]
-        return kept.clamp_min(max(1.0 - (step - FIRST_STEP) / FADE_STEPS, 0.0))
+        weight_of_trimmed = max(1.0 - (step - FIRST_STEP) / FADE_STEPS, 0.0)
+        return kept.clamp_min(weight_of_trimmed)
 
     def _quantile(self, share: float) -> Tensor:
         """The residual below which this share of those remembered lies, a scalar."""
-        return (BINS - (self.histogram.cumsum(0) >= share * self.histogram.sum()).sum() + 1) / BINS
+        reached = self.histogram.cumsum(0) >= share * self.histogram.sum()
+        return (BINS - reached.sum() + 1) / BINS
 
 
 def _mean_around(values: Tensor, side: int) -> Tensor:

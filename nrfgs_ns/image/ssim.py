@@ -63,9 +63,9 @@ class SsimInTorch(torch.autograd.Function):
         x, y, *slopes = ctx.saved_tensors
         # With zeros around, every pixel lies in whole windows: the gradient is as large as the image.
         padded = F.pad(torch.cat(slopes), (WINDOW_SIZE - 1,) * 4)
-        by_x, by_xx, by_xy = blur(padded, x.new_tensor(WEIGHTS)).split(3)
-        gradient = by_x.addcmul(x, by_xx, value=2.0).addcmul_(y, by_xy).mul_(d_mean / slopes[0].numel())
-        return gradient.permute(1, 2, 0), None
+        slope_x, slope_xx, slope_xy = blur(padded, x.new_tensor(WEIGHTS)).split(3)
+        d_prediction = slope_x.addcmul(x, slope_xx, value=2.0).addcmul_(y, slope_xy).mul_(d_mean / slopes[0].numel())
+        return d_prediction.permute(1, 2, 0), None
 
 
 def _similarity(x: Tensor, y: Tensor, xx: Tensor, yy: Tensor, xy: Tensor) -> tuple[Tensor, ...]:
@@ -75,9 +75,9 @@ def _similarity(x: Tensor, y: Tensor, xx: Tensor, yy: Tensor, xy: Tensor) -> tup
     C, D = squares + SSIM_C1, xx + yy - squares + SSIM_C2
     scale = 1 / (C * D)
     S = A * B * scale
-    by_xx, by_xy = -S / D, 2 * A * scale
-    by_x = 2 * (y * B * scale - x * (S / C + by_xx)) - y * by_xy
-    return S, by_x, by_xx, by_xy
+    slope_xx, slope_xy = -S / D, 2 * A * scale
+    slope_x = 2 * (y * B * scale - x * (S / C + slope_xx)) - y * slope_xy
+    return S, slope_x, slope_xx, slope_xy
 
 
 @tried_once("SSIM")

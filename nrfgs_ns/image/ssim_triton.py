@@ -138,13 +138,13 @@ def forward_kernel(
             S = A * B * scale
             ssim_sum += tl.where(inside, S, 0.0)
             if SLOPES:
-                by_xx = -S / D
-                by_xy = A * scale * 2.0
-                by_x = (y * B * scale - x * (S / C + by_xx)) * 2.0 - y * by_xy
+                slope_xx = -S / D
+                slope_xy = A * scale * 2.0
+                slope_x = (y * B * scale - x * (S / C + slope_xx)) * 2.0 - y * slope_xy
                 plane = height * width
-                tl.store(slopes + at, tl.where(inside, by_x, 0.0), mask=here)
-                tl.store(slopes + plane + at, tl.where(inside, by_xx, 0.0), mask=here)
-                tl.store(slopes + 2 * plane + at, tl.where(inside, by_xy, 0.0), mask=here)
+                tl.store(slopes + at, tl.where(inside, slope_x, 0.0), mask=here)
+                tl.store(slopes + plane + at, tl.where(inside, slope_xx, 0.0), mask=here)
+                tl.store(slopes + 2 * plane + at, tl.where(inside, slope_xy, 0.0), mask=here)
 
     program = tl.program_id(1) * tl.num_programs(0) + tl.program_id(0)
     mine = tl.sum(l1_sum * l1_scale + ssim_sum * ssim_scale, axis=0)
@@ -168,16 +168,16 @@ def backward_kernel(
         row = first - REACH + step
         row_width = tl.where((row >= 0) & (row < height), width, 0)  # nothing above and below the image
         start = slopes + row * width
-        by_x, of_x = _next_row(of_x, _blur(_taps(start, columns, row_width)))
-        by_xx, of_xx = _next_row(of_xx, _blur(_taps(start + plane, columns, row_width)))
-        by_xy, of_xy = _next_row(of_xy, _blur(_taps(start + 2 * plane, columns, row_width)))
+        slope_x, of_x = _next_row(of_x, _blur(_taps(start, columns, row_width)))
+        slope_xx, of_xx = _next_row(of_xx, _blur(_taps(start + plane, columns, row_width)))
+        slope_xy, of_xy = _next_row(of_xy, _blur(_taps(start + 2 * plane, columns, row_width)))
         centre = row - REACH
         if centre >= first:
             here = columns < tl.where(centre < height, width, 0)
             at = centre * width + columns
             x = tl.load(prediction + at, mask=here, other=0.0)
             y = tl.load(truth + at, mask=here, other=0.0)
-            from_ssim = by_x + x * by_xx * 2.0 + y * by_xy
+            from_ssim = slope_x + x * slope_xx * 2.0 + y * slope_xy
             from_l1 = tl.where(x > y, 1.0, 0.0) - tl.where(x < y, 1.0, 0.0)
             gradient = (from_ssim * ssim_scale + from_l1 * l1_scale) * upstream
             tl.store(d_prediction + at, gradient, mask=here)

@@ -16,7 +16,8 @@ from nrfgs_ns.image.photograph import PhotographModel
 def reduced_config(config: AppearanceHeadConfig, state: Mapping[str, Any]) -> AppearanceHeadConfig:
     """A head's configuration with the options that a checkpoint's head has set differently ("capacity")."""
     reduced = state.get("_extra_state", {}).get("capacity", {}).get("head", {})
-    return replace(config, **reduced) if reduced.keys() <= {field.name for field in fields(config)} else config
+    is_this_head = reduced.keys() <= {field.name for field in fields(config)}
+    return replace(config, **reduced) if is_this_head else config
 
 
 def differences(config: AppearanceHeadConfig, other: AppearanceHeadConfig) -> dict[str, Any]:

@@ -206,27 +206,27 @@ def backward_kernel(
             new_sums = ()
             for k in tl.static_range(EACH - 1, -1, -1):
                 _, dx, a_dx, b, c, y, _, _ = splats[k]
-                by_0, by_y, by_yy, by_red, by_green, by_blue, abs_x, abs_y = sums[k]
+                v0, vy, vyy, d_red, d_green, d_blue, abs_x, abs_y = sums[k]
                 more = gains[k] - mean
                 mean = tl.fma(drawn[k], more, mean)
                 v = tl.where(shown[k] <= MAX_ALPHA, weights[k] * more, 0.0)
                 dy = y - ((top + row).to(tl.float32) + 0.5)
-                by_0, by_y, by_yy = by_0 + v, tl.fma(v, dy, by_y), tl.fma(v, dy * dy, by_yy)
-                by_red, by_green = tl.fma(weights[k], red, by_red), tl.fma(weights[k], green, by_green)
-                by_blue = tl.fma(weights[k], blue, by_blue)
+                v0, vy, vyy = v0 + v, tl.fma(v, dy, vy), tl.fma(v, dy * dy, vyy)
+                d_red, d_green = tl.fma(weights[k], red, d_red), tl.fma(weights[k], green, d_green)
+                d_blue = tl.fma(weights[k], blue, d_blue)
                 if ABSGRAD:
                     abs_x = tl.fma(tl.abs(v), tl.abs(tl.fma(2.0, a_dx, b * dy)), abs_x)
                     abs_y = tl.fma(tl.abs(v), tl.abs(tl.fma(b, dx, 2.0 * c * dy)), abs_y)
-                new_sums = ((by_0, by_y, by_yy, by_red, by_green, by_blue, abs_x, abs_y),) + new_sums
+                new_sums = ((v0, vy, vyy, d_red, d_green, d_blue, abs_x, abs_y),) + new_sums
             sums = new_sums
         for k in tl.static_range(EACH):
             splat, dx, a_dx, b, c, _, _, _ = splats[k]
-            v, by_y, by_yy, by_red, by_green, by_blue, abs_x, abs_y = sums[k]
-            by_x = v * dx
-            _add(d_colors, splat, (by_red, by_green, by_blue), 3)
-            _add(d_opacities, splat, (v * (1.0 / tl.maximum(tl.load(opacities + splat), MIN_ALPHA)),), 1)
-            _add(d_means2d, splat, ((2.0 * v * a_dx + b * by_y) * LN_2, (b * by_x + 2.0 * c * by_y) * LN_2), 2)
-            _add(d_conics, splat, (-0.5 * by_x * dx, -by_y * dx, -0.5 * by_yy), 3)
+            v0, vy, vyy, d_red, d_green, d_blue, abs_x, abs_y = sums[k]
+            vx = v0 * dx
+            _add(d_colors, splat, (d_red, d_green, d_blue), 3)
+            _add(d_opacities, splat, (v0 * (1.0 / tl.maximum(tl.load(opacities + splat), MIN_ALPHA)),), 1)
+            _add(d_means2d, splat, ((2.0 * v0 * a_dx + b * vy) * LN_2, (b * vx + 2.0 * c * vy) * LN_2), 2)
+            _add(d_conics, splat, (-0.5 * vx * dx, -vy * dx, -0.5 * vyy), 3)
             if ABSGRAD:
                 _add(absgrad, splat, (abs_x * LN_2, abs_y * LN_2), 2)
 

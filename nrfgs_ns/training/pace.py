@@ -23,6 +23,8 @@ from statistics import median
 from time import perf_counter
 from typing import Any
 
+from nrfgs_ns.errors import InputError
+
 STEPS = 30_000
 """Length of the training that the methods' schedules are laid out for."""
 STEPS_PER_VIEW = 120
@@ -76,6 +78,12 @@ class Pace:
     def load_state(self, state: dict[str, Any]) -> None:
         """Go on from a checkpoint's `state`."""
         self.length, self.rate, self.position = state["length"], state["rate"], state["position"]
+
+    def plan(self, steps: int) -> None:
+        """Walk through the rest of the schedules in this number of steps."""
+        rate = (self.length - self.position) / steps
+        if not math.isclose(rate, self.rate, rel_tol=1e-9):  # an unchanged rate stays the same to the last bit
+            self.rate = max(rate, 1e-9)
 
 
 class TimedPace(Pace):
@@ -135,7 +143,8 @@ class TimedPace(Pace):
         if len(self._durations) >= STEPS_BEFORE_PLANNING:
             step = self.step_seconds
             # The schedules' last position is for the last step, not for one behind it.
-            self.rate = max(step / max(self.seconds - self.elapsed, step) * self._cost_ahead(), 1e-9)
+            seconds_left = max(self.seconds - self.elapsed, step)
+            self.rate = max(step / seconds_left * self._cost_ahead(), 1e-9)
         super().advance()
 
     def _cost_ahead(self) -> float:
@@ -159,6 +168,36 @@ class TimedPace(Pace):
     def load_state(self, state: dict[str, Any]) -> None:
         super().load_state(state)
         self.earlier_seconds = state.get("seconds", 0.0)
+
+    def plan(self, steps: int) -> None:
+        """Refuse a budget that is spent; the clock says how many steps there are."""
+        if self.is_spent:
+            budget = f"its time budget of {self.seconds / 60:g} minutes"
+            raise InputError(f"The training has used {budget}. A larger --time-budget goes on.")
+
+
+def resume(pace: Pace | None, saved: dict[str, Any] | None, step: int, steps: int, devices: int) -> None:
+    """Go on from a checkpoint's position on the schedules; InputError where they do not go on.
+
+    Args:
+        saved: `Pace.state` in the checkpoint; None: its schedules were not stretched.
+        step: the first step to come.
+        steps: number of steps to come; with a time budget it does not count.
+        devices: their number.
+    """
+    if saved is not None and (pace is None or type(pace) is Pace and pace.length != saved["length"]):
+        option = "a --time-budget" if "seconds" in saved else f"--schedule-steps {saved['length']}"
+        fix = f"Go on with {option}" if devices == 1 else "Go on with one device"
+        raise InputError(f"The schedules of the checkpoint's training are stretched. {fix}, or train anew.")
+    if pace is None:
+        return
+    if saved is not None:
+        pace.load_state(saved)
+    elif pace.length < step:
+        raise InputError(f"Schedules of {pace.length} steps end before step {step}. Give more --schedule-steps.")
+    else:
+        pace.position = float(step)
+    pace.plan(steps)
 
 
 def resolution_phases(num_downscales: int, resolution_schedule: int) -> Phases:

@@ -3,7 +3,6 @@
 the last steps, and an orderly end whatever its cause."""
 
 import gc
-import math
 import sys
 import warnings
 from collections.abc import Iterator
@@ -32,7 +31,7 @@ from nrfgs_ns.training.checkpoint_files import DiskFull
 from nrfgs_ns.training.guard import Guard, TrainingStopped
 from nrfgs_ns.training.identity import check_options, options_of
 from nrfgs_ns.training.optimizers import LeanOptimizers
-from nrfgs_ns.training.pace import Pace, TimedPace
+from nrfgs_ns.training.pace import Pace, TimedPace, resume
 from nrfgs_ns.training.progress import ProgressLine, end_earlier_logs
 from nrfgs_ns.training.step_graph import StepGraphs
 from nrfgs_ns.training.stopping import StopRequest, heard_signals, is_out_of_memory, rows_agree
@@ -146,39 +145,17 @@ class NrfgsTrainer(Trainer):
         self.optimizers.load_optimizers(content["optimizers"])
         if "schedulers" in content and config.load_scheduler:
             self.optimizers.load_schedulers(content["schedulers"])
-        self._resume_pace(training.get("pace"))
+        left = self.total_steps - self._start_step
+        resume(self.pace, training.get("pace"), self._start_step, left, self.world_size)
+        if not isinstance(self.pace, TimedPace):
+            self.config = replace(self.config, max_num_iterations=left)
+        if self.pace is not None:
+            self.pipeline.model.schedule_at(int(self.pace.position))
         if self.mean is not None and self.mean.is_saved and training.get("parameter_mean") is not None:
             self.mean.load_state(training["parameter_mean"], self.optimizers.optimizers)
         budget = config.time_budget
         total = f"{self.total_steps:,}" if budget is None else f"as many as fit into {budget:g} minutes"
         CONSOLE.print(f"Going on from {path}, at step {self._start_step} of {total}.", markup=False, soft_wrap=True)
-
-    def _resume_pace(self, saved: dict[str, Any] | None) -> None:
-        """Go on from the position on the schedules in a checkpoint (`Pace.state`; None: those were not stretched). The
-        remaining steps walk through the rest."""
-        pace = self.pace
-        if saved is not None and (pace is None or type(pace) is Pace and pace.length != saved["length"]):
-            option = "a --time-budget" if "seconds" in saved else f"--schedule-steps {saved['length']}"
-            fix = f"Go on with {option}" if self.world_size == 1 else "Go on with one device"
-            raise InputError(f"The schedules of the checkpoint's training are stretched. {fix}, or train anew.")
-        if not isinstance(pace, TimedPace):
-            self.config = replace(self.config, max_num_iterations=self.total_steps - self._start_step)
-        if pace is None:
-            return
-        if saved is not None:
-            pace.load_state(saved)
-        elif pace.length < (step := self._start_step):
-            raise InputError(f"Schedules of {pace.length} steps end before step {step}. Give more --schedule-steps.")
-        else:
-            pace.position = float(step)
-        if not isinstance(pace, TimedPace):
-            rate = (pace.length - pace.position) / self.config.max_num_iterations
-            if not math.isclose(rate, pace.rate, rel_tol=1e-9):  # an unchanged rate stays the same to the last bit
-                pace.rate = max(rate, 1e-9)
-        elif pace.is_spent:
-            budget = f"its time budget of {self.config.time_budget:g} minutes"
-            raise InputError(f"The training has used {budget}. A larger --time-budget goes on.")
-        self.pipeline.model.schedule_at(int(pace.position))
 
     def optimizer_configs(self) -> dict[str, Any]:
         """The configured optimisers; the means' learning rates, lengths in scene units, in world units."""

@@ -10,11 +10,10 @@ from head_cases import awake, scene
 from torch.testing import assert_close
 
 from nrfgs_ns.appearance.gsnb import GsnbConfig
-from nrfgs_ns.appearance.hash_grid import HashGrid
 from nrfgs_ns.appearance.head import SH_C0
 from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig, eval_sh, num_bases, sh_bases
-from nrfgs_ns.appearance.vdgs import VdgsConfig
+from nrfgs_ns.appearance.vdgs import HashGrid, VdgsConfig
 
 
 def unit(count):

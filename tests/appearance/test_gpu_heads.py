@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fused field and the hash grid on a CUDA device against PyTorch's in float64. `pytest -m gpu`."""
+"""The fused field on a CUDA device against PyTorch's in float64. `pytest -m gpu`."""
 
 import pytest
 import torch
 from fused_cases import assert_near, compare, evaluate, float32_tolerance, heads, rounding, scene
-from hash_grid_cases import assert_near_twin, grids, positions
 
 from nrfgs_ns.appearance.nrf import NrfConfig
 
@@ -114,30 +113,3 @@ def test_rows_beyond_32_bit_offsets():
     (colors.sum() + opacities.sum()).backward()
     assert all((table.grad[count - 3 :] != 0).any() for table in large.values())
     assert all((table.grad[: count - 3] == 0).all() for table in large.values())
-
-
-# The hash grid of VDGS.
-
-PAPER = {"levels": 4, "log2_table_size": 15, "base_resolution": 16}
-
-
-def interpolate(grid, x):
-    features = grid(x)
-    assert type(features.grad_fn).__name__ == "InterpolationBackward", "the kernels must have been taken"
-    return features
-
-
-@pytest.mark.parametrize("options", [{}, PAPER, {"levels": 7, "log2_table_size": 6}])
-@pytest.mark.parametrize("count", [0, 1, 129, 100_000])
-def test_hash_grid_values_and_gradients(count, options):
-    assert_near_twin(*grids("cuda", **options), positions(count, "cuda"), interpolate)
-
-
-def test_what_is_no_lattice_coordinate():
-    grid, _ = grids("cuda", **PAPER)
-    wild = [[1e12, -1e12, 1e30], [-1e30] * 3, [0.1, torch.nan, 0.1], [0.1, 0.1, torch.inf], [0.3, -0.2, 0.1]]
-    x = torch.tensor(wild, device="cuda", requires_grad=True)
-    features = interpolate(grid, x)
-    features.sum().backward()
-    assert features[2:4].isnan().all()
-    assert torch.isfinite(features[[0, 1, 4]]).all() and torch.isfinite(x.grad[[0, 1, 4]]).all()

@@ -10,12 +10,11 @@ from torch.testing import assert_close
 
 from nrfgs_ns.appearance import gsnb, vdgs
 from nrfgs_ns.appearance.gsnb import GsnbConfig
-from nrfgs_ns.appearance.hash_grid import HashGrid
 from nrfgs_ns.appearance.head import AppearanceHead, AppearanceHeadConfig, SplatAppearance
 from nrfgs_ns.appearance.nrf import NrfConfig, view_geometry
 from nrfgs_ns.appearance.sg import SgConfig
 from nrfgs_ns.appearance.sh import ShConfig
-from nrfgs_ns.appearance.vdgs import VdgsConfig
+from nrfgs_ns.appearance.vdgs import HashGrid, VdgsConfig
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.model.config import NrfgsModelConfig
 

@@ -24,8 +24,7 @@ from nrfgs_ns.appearance.reduce import build
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import LARGEST_LOGIT, encode
 from nrfgs_ns.compact.entropy import encode_table
-from nrfgs_ns.compact.finetune import CodedSplats, Gated, fine_tune, growth_without
-from nrfgs_ns.compact.rate import Density, Rounded, bits_of_places
+from nrfgs_ns.compact.finetune import CodedSplats, Density, Gated, Rounded, bits_of_places, fine_tune, growth_without
 from nrfgs_ns.compact.tables import NEAR, OCTAHEDRAL, STEPS, Grid, from_morton, morton, nearest_turn
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Export

@@ -6,7 +6,7 @@ import torch
 from densification_cases import Table, rotations
 from torch.testing import assert_close
 
-from nrfgs_ns.densification.relocation import add_noise, add_samples, relocate, split_evenly
+from nrfgs_ns.densification.mcmc import add_noise, add_samples, relocate, split_evenly
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -56,7 +56,7 @@ def test_relocated_splats_become_copies_of_live_ones():
     dead[::5] = True
     before = {name: value.detach().clone() for name, value in table.splats.items()}
     torch.manual_seed(0)
-    source = relocate(table.splats, table.optimizers, dead, 0.005)
+    source = relocate(table.splats, table.optimizers, dead)
     table.check()
     parents = table.splats["latents"][:, 0].long()
     assert torch.equal(source, parents)
@@ -78,7 +78,7 @@ def test_relocated_splats_become_copies_of_live_ones():
 def test_extremes():
     table = Table(5)
     before = table.splats["latents"].detach().clone()
-    source = relocate(table.splats, table.optimizers, torch.ones(5, dtype=torch.bool), 0.005)
+    source = relocate(table.splats, table.optimizers, torch.ones(5, dtype=torch.bool))
     assert torch.equal(source, torch.arange(5))
     assert torch.equal(table.splats["latents"].detach(), before)
     one, many = (split_evenly(torch.tensor([0.5]), torch.ones(1, 3), torch.tensor([count])) for count in (51, 1000))
@@ -92,7 +92,7 @@ def test_extremes():
 def test_added_splats_are_copies_with_fresh_moments():
     table = Table(50)
     torch.manual_seed(0)
-    source = add_samples(table.splats, table.optimizers, 20, 0.005)
+    source = add_samples(table.splats, table.optimizers, 20)
     table.check()
     assert len(table) == 70
     assert torch.equal(source, table.splats["latents"][:, 0].long())

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from make_gsplat_fixtures import CASES, Case, _camera, _cloud, evaluate, load, upstream
 
 from nrfgs_ns.rasterizer import ProjectionOptions, contributions, project
-from nrfgs_ns.rasterizer.torch_cpu import batches, compositing, projection
+from nrfgs_ns.rasterizer.torch_cpu import compositing, projection, tiles
 
 
 def check(case: Case, dtype: torch.dtype = torch.float32, **limits) -> None:
@@ -62,7 +62,7 @@ def test_contributions_to_hard_cases(name, device):
 def test_any_partition_of_the_work_gives_the_same_result(name, monkeypatch):
     """Slabs of 5, batches of a few tiles and blocks of 100 pairs: every loop is taken, every state handed over."""
     monkeypatch.setattr(compositing, "SLAB", 5)
-    monkeypatch.setattr(batches, "BATCH_ELEMENTS", 64 * 13)
+    monkeypatch.setattr(tiles, "BATCH_ELEMENTS", 64 * 13)
     monkeypatch.setattr(compositing, "BLOCK_PAIRS", 100)
     check(CASES[name]())
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The CPU back end: `projection`, `tiles`, `batches`, `compositing`. Their float64 twin lives with the tests."""
+"""The CPU back end: `projection`, `tiles`, `compositing`. Their float64 twin lives with the tests."""

@@ -27,7 +27,8 @@ deliver,
 
     dL/dln o = sum v,    dL/dm = sum v Q d,    dL/d(a, b, c) = -sum v (dx^2 / 2, dx dy, dy^2 / 2),
 
-and absgrad is sum |v Q d|, the only one that needs a pass of its own. `batches.py` says what is computed together.
+and absgrad is sum |v Q d|, the only one that needs a pass of its own. In the code d_y stands for dL/dy. `tiles.py` says
+what is computed together.
 """
 
 from __future__ import annotations
@@ -41,8 +42,21 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from .. import Projection
-from .batches import LN_2, MAX_ALPHA, SLAB, Batch, Canvas, LocalSplats, expand_around_centres, group_by_count, pairs_of
-from .tiles import TileLists, find_footprints, list_tiles, split_into_blocks
+from .tiles import (
+    LN_2,
+    MAX_ALPHA,
+    SLAB,
+    Batch,
+    Canvas,
+    LocalSplats,
+    TileLists,
+    expand_around_centres,
+    find_footprints,
+    group_by_count,
+    list_tiles,
+    pairs_of,
+    split_into_blocks,
+)
 
 MIN_TRANSMITTANCE = 1e-4  # a pixel ends before T falls to this
 BLOCK_PAIRS = 2**21  # (tile, splat) pairs listed at a time; about 200 bytes each, forward and backward
@@ -148,12 +162,12 @@ def _sweep(canvas: Canvas, lists: TileLists, final: Tensor, render: Tensor | Non
 
 
 def _backward_batch(
-    canvas: Canvas, batch: Batch, grad: Tensor, behind: Tensor, absgrad: bool, gradients: Tensor
+    canvas: Canvas, batch: Batch, d_render: Tensor, behind: Tensor, absgrad: bool, gradients: Tensor
 ) -> Tensor:
     """The backward equations of the module docstring for one batch; returns U in front of the first splat, [B, P].
 
     Args:
-        grad: dL/dC of its tiles. [B, D, P]
+        d_render: dL/dC of its tiles. [B, D, P]
         behind: U_n, behind the last splat. [B, P]
         gradients: receives those of centre x, y, conic a, b, c, ln o, colours, then absgrad. [B * n, 6 + D (+ 2)]
     """
@@ -161,7 +175,7 @@ def _backward_batch(
     blend = _blend(canvas, splats, start)
     n_tiles, n, pixels = blend.weights.shape
     e, e_slices = canvas.scratch.array("spare", n_tiles, n, pixels)
-    torch.bmm(splats.colors, grad, out=e)
+    torch.bmm(splats.colors, d_render, out=e)
     U, U_slices = canvas.scratch.array("T or U", n_tiles, n + 1, pixels)  # U_0 ... U_n
     U_slices[-1].copy_(behind)
     for k in range(n - 1, -1, -1):
@@ -177,15 +191,15 @@ def _backward_batch(
     mx, my = splats.centres
     _, gx, gy, a, b, c = splats.coefficients  # here a, b, c are the conic's with a minus
     half_x, half_y = torch.addcmul(vx, mx, v0, value=-0.5), torch.addcmul(vy, my, v0, value=-0.5)
-    by_x, by_y, by_a, by_b, by_c, by_log_opacity = gradients[:, :6].t()
-    torch.mul(gx, v0, out=by_x).addcmul_(a, vx).addcmul_(b, vy)
-    torch.mul(gy, v0, out=by_y).addcmul_(b, vx).addcmul_(c, vy)
-    torch.mul(mx, half_x, out=by_a).sub_(vxx)
-    torch.mul(mx, half_y, out=by_b).addcmul_(my, half_x).sub_(vxy)
-    torch.mul(my, half_y, out=by_c).sub_(vyy)
-    by_log_opacity.copy_(v0)
-    of_colors = torch.bmm(grad, blend.weights.transpose(1, 2))  # [B, D, n]
-    gradients[:, 6 : 6 + channels].view(n_tiles, n, channels).copy_(of_colors.transpose(1, 2))
+    d_mx, d_my, d_a, d_b, d_c, d_log_opacity = gradients[:, :6].t()
+    torch.mul(gx, v0, out=d_mx).addcmul_(a, vx).addcmul_(b, vy)
+    torch.mul(gy, v0, out=d_my).addcmul_(b, vx).addcmul_(c, vy)
+    torch.mul(mx, half_x, out=d_a).sub_(vxx)
+    torch.mul(mx, half_y, out=d_b).addcmul_(my, half_x).sub_(vxy)
+    torch.mul(my, half_y, out=d_c).sub_(vyy)
+    d_log_opacity.copy_(v0)
+    d_colors = torch.bmm(d_render, blend.weights.transpose(1, 2))  # [B, D, n]
+    gradients[:, 6 : 6 + channels].view(n_tiles, n, channels).copy_(d_colors.transpose(1, 2))
     if absgrad:
         size = v.abs_()
         for axis, coefficients in enumerate(([gx, a, b], [gy, b, c])):  # -Q d is linear in the pixel: in (1, x, y)
@@ -196,24 +210,24 @@ def _backward_batch(
 
 
 def _backward_block(
-    canvas: Canvas, lists: TileLists, work: list[Batch], grad: Tensor, behind: Tensor, absgrad: bool, n_columns: int
+    canvas: Canvas, lists: TileLists, work: list[Batch], d_render: Tensor, behind: Tensor, absgrad: bool, n_columns: int
 ) -> Tensor:
     """Gradients of one block by its footprints, in the columns of `_backward_batch`. [F, columns]
 
     Args:
         work: the batches of its `_sweep`.
-        grad: dL/dC. [C * tiles, D, P]
+        d_render: dL/dC. [C * tiles, D, P]
         behind: U behind the last splat; afterwards U in front of the first one. [C * tiles, P]
     """
     # Gradients in the order of work, and the row of each slot; pairs beyond all batches share a row of 0.
     end = sum(batch.pairs.numel() for batch in work)
-    gradients = grad.new_empty(end + 1, n_columns)
+    gradients = d_render.new_empty(end + 1, n_columns)
     gradients[end] = 0
     row_of_slot = torch.full((lists.n_pairs + 1,), end)
     for batch in reversed(work):
         on_canvas = lists.tiles.index_select(0, batch.tiles)
         begin = end - batch.pairs.numel()
-        grads = grad.index_select(0, on_canvas), behind.index_select(0, on_canvas)
+        grads = d_render.index_select(0, on_canvas), behind.index_select(0, on_canvas)
         in_front = _backward_batch(canvas, batch, *grads, absgrad, gradients[begin:end])
         behind.index_copy_(0, on_canvas, in_front)
         slots = lists.slot.index_select(0, batch.pairs.flatten())
@@ -264,24 +278,24 @@ class CompositeSplats(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     @full_precision()
-    def backward(ctx, grad_render: Tensor, grad_transmittance: Tensor):
+    def backward(ctx, d_render: Tensor, d_transmittance: Tensor):
         means2d, conics, opacities, colors = ctx.saved_tensors
         canvas = ctx.canvas
-        grad = canvas.tiled(grad_render)
-        behind = canvas.tiled(grad_transmittance).squeeze(1).clone()  # U_n
+        d_render = canvas.tiled(d_render)
+        behind = canvas.tiled(d_transmittance).squeeze(1).clone()  # U_n
         channels = colors.shape[1]
         n_columns = 6 + channels + (2 if ctx.absgrad else 0)
-        drawn = grad.new_zeros(canvas.footprints.rows.numel(), n_columns)
+        drawn = d_render.new_zeros(canvas.footprints.rows.numel(), n_columns)
         for block, record in zip(ctx.blocks, ctx.records, strict=True):
             if record is None:
                 lists = list_tiles(canvas.footprints, block)
                 record = lists, _sweep(canvas, lists, torch.empty_like(canvas.inside), None)
-            drawn += _backward_block(canvas, *record, grad, behind, ctx.absgrad, n_columns)
+            drawn += _backward_block(canvas, *record, d_render, behind, ctx.absgrad, n_columns)
         drawn[:, :2] *= -LN_2  # the coefficients are those of l / ln 2
         drawn[:, 6 + channels :] *= LN_2
-        total = grad.new_zeros(means2d.shape[0], n_columns).index_copy_(0, canvas.footprints.rows, drawn)
+        total = d_render.new_zeros(means2d.shape[0], n_columns).index_copy_(0, canvas.footprints.rows, drawn)
         if ctx.absgrad:
             means2d.absgrad = total[:, -2:].contiguous()
-        grad_opacities = total[:, 5] / opacities.where(opacities > 0, 1.0)
-        grad_colors = total[:, 6 : 6 + channels]
-        return total[:, :2].contiguous(), total[:, 2:5].contiguous(), grad_opacities, grad_colors, None, None
+        d_opacities = total[:, 5] / opacities.where(opacities > 0, 1.0)
+        d_colors = total[:, 6 : 6 + channels]
+        return total[:, :2].contiguous(), total[:, 2:5].contiguous(), d_opacities, d_colors, None, None

@@ -19,10 +19,10 @@ the rows a_0, a_1 of A they are not:
     det(cov2d)       = |a_0 x a_1|^2
     det(cov2d + e I) = det(cov2d) + e trace(cov2d) + e^2.
 
-Backward, each equation above in reverse. Here and in the code by_y stands for dL/dy. The two less usual ones are
+Backward, each equation above in reverse. Here and in the code d_y stands for dL/dy. The two less usual ones are
 
-    by_a0 = a_1 x by_n,    by_a1 = by_n x a_0             for the cross product n = a_0 x a_1,
-    by_q = (by_q' - q' (q' . by_q')) / |q|                for the direction q' = q / |q|.
+    d_a0 = a_1 x d_n,    d_a1 = d_n x a_0                 for the cross product n = a_0 x a_1,
+    d_q = (d_q' - q' (q' . d_q')) / |q|                   for the direction q' = q / |q|.
 
 All arrays hold one row per coordinate and one column per splat: each line below is one pass over memory.
 """
@@ -176,71 +176,71 @@ class ProjectSplats(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, _ids, _radii, by_means2d, by_depths, by_conics, by_compensations):
+    def backward(ctx, _ids, _radii, d_means2d, d_depths, d_conics, d_compensations):
         means, quats, scales, viewmat, K, ids = ctx.saved_tensors
         seen = [table.index_select(0, ids) for table in (means, quats, scales)]
         screen = _to_screen(*seen, viewmat, K, *ctx.size)
-        by_position, by_axes = _back_to_camera(screen, K, by_means2d, by_depths, by_conics, by_compensations)
+        d_position, d_axes = _back_to_camera(screen, K, d_means2d, d_depths, d_conics, d_compensations)
         W = viewmat[:3, :3]
-        by_means = torch.stack(_rotate(W.t(), by_position), -1)
+        d_means = torch.stack(_rotate(W.t(), d_position), -1)
         scaled = seen[2].t()
-        by_local = torch.stack(_rotate(W.t(), by_axes))  # of R_q diag(s). [3, 3, n]
-        by_scales = (by_local * screen.rotations).sum(0).t()
-        by_quats = _back_to_quats(screen, by_local * scaled, seen[1])
-        tables = zip((means, quats, scales), (by_means, by_quats, by_scales), strict=True)
-        by_tables = [torch.zeros_like(table).index_copy_(0, ids, rows) for table, rows in tables]
-        by_viewmat = None
+        d_local = torch.stack(_rotate(W.t(), d_axes))  # of R_q diag(s). [3, 3, n]
+        d_scales = (d_local * screen.rotations).sum(0).t()
+        d_quats = _back_to_quats(screen, d_local * scaled, seen[1])
+        tables = zip((means, quats, scales), (d_means, d_quats, d_scales), strict=True)
+        d_tables = [torch.zeros_like(table).index_copy_(0, ids, rows) for table, rows in tables]
+        d_viewmat = None
         if ctx.needs_input_grad[3]:
-            by_viewmat = torch.zeros_like(viewmat)
+            d_viewmat = torch.zeros_like(viewmat)
             local = screen.rotations * scaled
             for i in range(3):
-                by_viewmat[i, :3] = (by_position[i][:, None] * seen[0]).sum(0) + (by_axes[i] * local).sum((1, 2))
-                by_viewmat[i, 3] = by_position[i].sum()
-        return *by_tables, by_viewmat, None, None, None
+                d_viewmat[i, :3] = (d_position[i][:, None] * seen[0]).sum(0) + (d_axes[i] * local).sum((1, 2))
+                d_viewmat[i, 3] = d_position[i].sum()
+        return *d_tables, d_viewmat, None, None, None
 
 
 def _back_to_camera(
-    screen: _Screen, K: Tensor, by_means2d: Tensor, by_depths: Tensor, by_conics: Tensor, by_compensations: Tensor
+    screen: _Screen, K: Tensor, d_means2d: Tensor, d_depths: Tensor, d_conics: Tensor, d_compensations: Tensor
 ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
     """Gradients of the camera-space position p, [n] each, and of the rows of W R_q diag(s), [3, n] each."""
     fx, fy = K[0, 0], K[1, 1]
     z, (u, v), (a0, a1) = screen.depths, screen.clamped, screen.rows
     right, down, forward = screen.axes
 
-    by_conics = (by_conics / screen.det_blurred[:, None]).t().contiguous()
-    by_yy, by_xy, by_xx = by_conics[0], -by_conics[1], by_conics[2]
+    d_conics = (d_conics / screen.det_blurred[:, None]).t().contiguous()
+    d_yy, d_xy, d_xx = d_conics[0], -d_conics[1], d_conics[2]
     # The slope of the root is bounded as in gsplat, 1 / (2 (sqrt(x) + 1e-6)): finite where a flat splat has x = 0.
     root = _compensations(screen)
-    by_ratio = (by_compensations * 0.5 / (root + COMPENSATION_EPS)) / screen.det_blurred
-    by_inverse = -(by_conics * _conics(screen).t()).sum(0)
+    d_ratio = (d_compensations * 0.5 / (root + COMPENSATION_EPS)) / screen.det_blurred
+    d_inverse = -(d_conics * _conics(screen).t()).sum(0)
     # det(cov2d) counts by itself and as a part of det(cov2d + e I). The two nearly cancel for a large splat: their
     # difference, 1 - root^2, is written as the blur's part of the determinant.
     xx, _, yy = screen.blurred
-    by_det = by_inverse + by_ratio * (EPS2D * (xx + yy - EPS2D) / screen.det_blurred)
-    by_trace = EPS2D * (by_inverse - by_ratio * root * root)
-    by_xx, by_yy = by_xx + by_trace, by_yy + by_trace
+    d_det = d_inverse + d_ratio * (EPS2D * (xx + yy - EPS2D) / screen.det_blurred)
+    d_trace = EPS2D * (d_inverse - d_ratio * root * root)
+    d_xx, d_yy = d_xx + d_trace, d_yy + d_trace
 
-    by_normal = 2 * by_det * screen.normal
-    by_a0 = torch.linalg.cross(a1, by_normal, dim=0) + 2 * by_xx * a0 + by_xy * a1
-    by_a1 = torch.linalg.cross(by_normal, a0, dim=0) + 2 * by_yy * a1 + by_xy * a0
-    by_z = by_depths - ((by_a0 * a0).sum(0) + (by_a1 * a1).sum(0)) / z
-    by_right, by_down = (fx / z) * by_a0, (fy / z) * by_a1
-    by_forward = -(u * by_right + v * by_down)
+    d_normal = 2 * d_det * screen.normal
+    d_a0 = torch.linalg.cross(a1, d_normal, dim=0) + 2 * d_xx * a0 + d_xy * a1
+    d_a1 = torch.linalg.cross(d_normal, a0, dim=0) + 2 * d_yy * a1 + d_xy * a0
+    d_z = d_depths - ((d_a0 * a0).sum(0) + (d_a1 * a1).sum(0)) / z
+    d_right, d_down = (fx / z) * d_a0, (fy / z) * d_a1
+    d_forward = -(u * d_right + v * d_down)
 
-    by_slopes = []
-    for axis, (f, clamped_slope, by_axis) in enumerate(((fx, u, by_right), (fy, v, by_down))):
+    d_slopes = []
+    for axis, (f, clamped_slope, d_axis) in enumerate(((fx, u, d_right), (fy, v, d_down))):
         unclamped = clamped_slope == screen.slopes[axis]
-        by_slopes.append(f * by_means2d[:, axis] - (by_axis * forward).sum(0).where(unclamped, 0.0))
-    by_x, by_y = (by_slope / z for by_slope in by_slopes)
-    by_z = by_z - by_x * screen.slopes[0] - by_y * screen.slopes[1]
-    return (by_x, by_y, by_z), (by_right, by_down, by_forward)
+        d_slopes.append(f * d_means2d[:, axis] - (d_axis * forward).sum(0).where(unclamped, 0.0))
+    d_x, d_y = (d_slope / z for d_slope in d_slopes)
+    d_z = d_z - d_x * screen.slopes[0] - d_y * screen.slopes[1]
+    return (d_x, d_y, d_z), (d_right, d_down, d_forward)
 
 
-def _back_to_quats(screen: _Screen, by_rotations: Tensor, quats: Tensor) -> Tensor:
+def _back_to_quats(screen: _Screen, d_rotations: Tensor, quats: Tensor) -> Tensor:
     """Gradients of the quaternions [n, 4] from those of their rotation matrices [3, 3, n]."""
     w, x, y, z = screen.directions
-    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = by_rotations
-    by_unit = 2 * torch.stack(
+    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = d_rotations
+    d_unit = 2 * torch.stack(
         [
             x * (r21 - r12) + y * (r02 - r20) + z * (r10 - r01),
             w * (r21 - r12) + y * (r01 + r10) + z * (r02 + r20) - 2 * x * (r11 + r22),
@@ -248,5 +248,5 @@ def _back_to_quats(screen: _Screen, by_rotations: Tensor, quats: Tensor) -> Tens
             w * (r10 - r01) + x * (r02 + r20) + y * (r12 + r21) - 2 * z * (r00 + r11),
         ]
     )
-    tangent = by_unit - screen.directions * (screen.directions * by_unit).sum(0)
+    tangent = d_unit - screen.directions * (screen.directions * d_unit).sum(0)
     return tangent.t() / quats.norm(dim=-1, keepdim=True)
