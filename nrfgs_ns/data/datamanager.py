@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from traceback import walk_tb
 from typing import Any, Literal
 
 import numpy as np
@@ -128,7 +129,10 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         """reads the next image while this one is trained on"""
         try:
             super().__init__(config, *args, **kwargs)
-        except (OSError, LookupError, AttributeError, AssertionError) as error:  # of nerfstudio's own parsers
+        except (OSError, LookupError, AttributeError, AssertionError, TypeError, ValueError) as error:
+            calls = [frame.f_globals["__name__"] for frame, _ in walk_tb(error.__traceback__)]
+            if not isinstance(error, OSError) and any(name.startswith("nrfgs_ns.") for name in calls[1:]):
+                raise  # only nerfstudio's own parsers raise these for a user's mistake
             finding = f"cannot be read ({type(error).__name__}: {' '.join(str(error).split())})"
             fix = "Check the path in --data or config.yml, and what kind of data set it is."
             raise InputError(f"{config.data or config.dataparser.data} {finding}. {fix}") from error

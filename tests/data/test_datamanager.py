@@ -191,6 +191,17 @@ def test_data_of_another_kind_is_told(capture):
         NrfgsDatamanagerConfig(dataparser=parser).setup(device="cpu")
 
 
+@pytest.mark.parametrize("kind", [AttributeError, AssertionError, KeyError, TypeError])
+@pytest.mark.parametrize("place", ["dataparser.check_options", "datamanager.different_views"])
+def test_mistakes_of_our_own_keep_their_traceback(capture, monkeypatch, place, kind):
+    def mistaken(_):
+        raise kind("ours")
+
+    monkeypatch.setattr(f"nrfgs_ns.data.{place.replace('dataparser.', 'dataparser.checks.')}", mistaken)
+    with pytest.raises(kind, match="ours"):
+        manager(capture)
+
+
 def test_no_room_for_files_is_said(capture, tmp_path, monkeypatch):
     (tmp_path / "cache").write_text("in the way")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
