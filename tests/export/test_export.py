@@ -329,6 +329,11 @@ def test_mistakes_are_told_in_a_sentence(trained, tmp_path):
         for name, report in (("file/s.html", None), ("s.html", tmp_path / "file" / "report.json")):
             with pytest.raises(InputError, match="cannot be written"):
                 kind(trained["nrfgs"], output=tmp_path / name, report=report).main()
+    for kind, output, report in ((Ply, "s.ply", "a/../s.ply"), (Compact, "s", "s"), (Web, "page", "page/scene.nrf")):
+        with pytest.raises(InputError, match="--output .* would replace --report. Give each a name of its own"):
+            kind(trained["nrfgs"], output=tmp_path / output, report=tmp_path / report).main()
+    with pytest.raises(InputError, match="--output .* would replace the training's file"):
+        Ply(trained["nrfgs"], output=trained["nrfgs"]).main()
     with pytest.raises(InputError, match="the 'sh' head.*nrfgs export ply"):
         Web(trained["nrfgs-sh"], output=tmp_path / "page.html").main()
     lost = tmp_path / "config.yml"

@@ -19,7 +19,7 @@ from nrfgs_ns.data.pictures import picture_names
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.compact import load_field, write_file
-from nrfgs_ns.export.options import CompactOptions, WebOptions
+from nrfgs_ns.export.options import SCENE, CompactOptions, WebOptions
 from nrfgs_ns.export.web.guide import read_notes, read_tour
 from nrfgs_ns.export.web.page import page
 from nrfgs_ns.files import write_whole
@@ -28,8 +28,6 @@ from nrfgs_ns.model.pinholes import pinhole
 from nrfgs_ns.threads import few_threads
 from nrfgs_ns.trained.loading import finish, lost
 
-SCENE = "scene.nrf"
-"""Name of the scene's file in a folder."""
 POSTER_SIDE = 960
 """Longest side of the poster, pixels."""
 MOST_WEIGHTS = 1024
