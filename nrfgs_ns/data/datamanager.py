@@ -137,6 +137,12 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
             fix = "Check the path in --data or config.yml, and what kind of data set it is."
             raise InputError(f"{config.data or config.dataparser.data} {finding}. {fix}") from error
 
+    @property
+    def evaluated_split(self) -> Literal["test", "training"]:
+        """What evaluations are of: "training" where the data set keeps no image for testing."""
+        trained, evaluated = (set(data.image_filenames) for data in (self.train_dataset, self.eval_dataset))
+        return "training" if evaluated <= trained else "test"
+
     def load_all_images(self) -> None:
         """Decode all images. InputError if an image or a mask cannot be used, or nothing is visible in any training
         image."""
