@@ -28,6 +28,7 @@ NEUTRAL = (
     "pipeline.datamanager.dataparser.data.",
     "pipeline.datamanager.dataparser.colmap_path.",
     "pipeline.datamanager.dataparser.images_path.",
+    "pipeline.datamanager.dataparser.mask_color.",
 )
 """Options in those groups that change no number, or whose images and poses are compared instead."""
 FAR = 0.01

@@ -5,6 +5,7 @@ import math
 import os
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from itertools import count
 from pathlib import Path
 from pkgutil import resolve_name
@@ -25,6 +26,8 @@ from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS, Pace, TimedPace, resolut
 TRAINER = "nrfgs_ns.training.trainer:NrfgsTrainer"
 SEVERAL_DEVICES = "nrfgs_ns.distributed"
 """These import this module."""
+TRACKERS = {"wandb": "wandb", "comet": "comet_ml"}
+"""Packages of the trackers that --vis names."""
 AVERAGED = 200
 """Steps to average in the presets and where the steps are chosen by the views."""
 MOST = 2**32
@@ -78,6 +81,10 @@ class NrfgsTrainerConfig(TrainerConfig):
                 raise InputError(f"{name} is {value}; these methods train without it. Leave it out.")
         positive = math.ulp(0.0)
         data = self.pipeline.datamanager
+        if color := getattr(data.dataparser, "mask_color", None):
+            fix = "Leave it out, or make them transparent and choose --pipeline.model.background-color."
+            name = "pipeline.datamanager.dataparser.mask_color"
+            raise InputError(f"{name} is {color}; masked pixels are not trained on, whatever their colour. {fix}")
         if (order := data.train_cameras_sampling_strategy) != "random":
             name = "pipeline.datamanager.train_cameras_sampling_strategy"
             raise InputError(f"{name} is {order}; these methods draw cameras at random. Leave it out.")
@@ -158,7 +165,24 @@ class NrfgsTrainerConfig(TrainerConfig):
             raise InputError(f"--data {shown(str(data))}: no such file or folder. Check the path.")
         if devices > 1:
             resolve_name(f"{SEVERAL_DEVICES}.launch:prepare")(self)
+        self._check_tracker()
         CONSOLE.print(f"{self.method_name} on {data or _absolute(parser.data)}", **PLAIN)
+
+    def _check_tracker(self) -> None:
+        """Raise InputError where the tracker of `vis` is missing or lacks a key: nerfstudio starts it when the
+        photographs are read. At a terminal wandb asks for the key."""
+        name = self.vis.removeprefix("viewer+")
+        if (package := TRACKERS.get(name)) is None:
+            return
+        try:
+            tracker = import_module(package)
+            if name == "wandb":
+                tracker.login()
+            elif not tracker.get_config("comet.api_key"):
+                raise ValueError("No API key")
+        except Exception as error:  # each has its own
+            fix = f"Run `pip install {package}` and `{name} login`, or give --vis tensorboard."
+            raise InputError(f"vis is {self.vis}, which cannot start: {error}. {fix}") from error
 
     def save_config(self) -> None:
         """Make the training's folder and save config.yml there, with absolute paths; InputError where it cannot be
