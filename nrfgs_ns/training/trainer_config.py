@@ -182,7 +182,7 @@ class NrfgsTrainerConfig(TrainerConfig):
                 raise ValueError("No API key")
         except Exception as error:  # each has its own
             fix = f"Run `pip install {package}` and `{name} login`, or give --vis tensorboard."
-            raise InputError(f"vis is {self.vis}, which cannot start: {error}. {fix}") from error
+            raise InputError(f"vis is {self.vis}, which cannot start: {str(error).rstrip('.')}. {fix}") from error
 
     def save_config(self) -> None:
         """Make the training's folder and save config.yml there, with absolute paths; InputError where it cannot be
