@@ -28,6 +28,8 @@ UNREAD = ("k5", "k6", "s1", "s2", "s3", "s4", "is_fisheye")
 """OpenCV's larger models, which neither nerfstudio nor we undistort, and instant-ngp's name of a fisheye."""
 DRAWN = (CameraType.PERSPECTIVE, CameraType.FISHEYE)
 """Pinholes, and cameras whose photographs are undistorted to a pinhole's."""
+LENS = ("fx", "fy", "cx", "cy", "width", "height")
+"""Fields of a camera that undistortion changes."""
 SMALLEST, LARGEST = 4, 2**16
 """Pixels of an image along each side."""
 WIDEST, NARROWEST = 0.1, 1e3
@@ -250,22 +252,37 @@ def cameras_of(meta: dict[str, Any], lenses: np.ndarray, poses: Tensor, source: 
     return Cameras(poses, fx, fy, cx, cy, width, height, distortion, kind, metadata={})
 
 
-def _check_distortion(lens: np.ndarray, kind: CameraType, where: str) -> None:
-    """Check that undistorting leaves enough of the image."""
+def undistorted_lens(lens: np.ndarray, kind: CameraType) -> tuple[np.ndarray, np.ndarray, np.ndarray, Sequence[int]]:
+    """A photograph's lens as OpenCV undistorts it for nerfstudio, with pixel centres at whole numbers.
+
+    Args:
+        lens: a row of `read_lenses`, [12].
+        kind: one of DRAWN.
+
+    Returns:
+        Its matrix [3, 3], its distortion, the pinhole [3, 3], and the part of that one's image that is kept: x, y,
+        width, height.
+    """
     fx, fy, cx, cy, w, h, k1, k2, k3, k4, p1, p2 = lens
     K = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
     size = int(w), int(h)
     if kind == CameraType.FISHEYE:
-        flat = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
-            K, np.array([k1, k2, k3, k4]), size, np.eye(3), balance=0
-        )
-        enough = True
-    elif k4 != 0:
-        raise InputError(f"{where} has k4 = {k4:g}, which is for fisheyes. Set it to 0, or undistort the images.")
-    else:
-        parameters = np.array([k1, k2, p1, p2, k3])
-        flat, part = cv2.getOptimalNewCameraMatrix(K, parameters, size, 0)
-        enough = part[2] * part[3] >= LEFT_OF_IMAGE * w * h and not _folds(K, parameters, size, flat, part)
+        distortion = np.array([k1, k2, k3, k4])
+        flat = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(K, distortion, size, np.eye(3), balance=0)
+        return K, distortion, flat, (0, 0, *size)
+    distortion = np.array([k1, k2, p1, p2, k3])
+    return K, distortion, *cv2.getOptimalNewCameraMatrix(K, distortion, size, 0)
+
+
+def _check_distortion(lens: np.ndarray, kind: CameraType, where: str) -> None:
+    """Check that undistorting leaves enough of the image."""
+    fx, fy, _, _, w, h, _, _, _, k4, _, _ = lens
+    K, distortion, flat, part = undistorted_lens(lens, kind)
+    enough = True
+    if kind != CameraType.FISHEYE:
+        if k4 != 0:
+            raise InputError(f"{where} has k4 = {k4:g}, which is for fisheyes. Set it to 0, or undistort the images.")
+        enough = part[2] * part[3] >= LEFT_OF_IMAGE * w * h and not _folds(K, distortion, (w, h), flat, part)
     change = flat[[0, 1], [0, 1]] / (fx, fy)
     if not (enough and ((LEAST_FOCAL < change) & (change < MOST_FOCAL)).all()):
         raise InputError(f"{where} leaves next to nothing of the image. Correct it, or undistort the photographs.")

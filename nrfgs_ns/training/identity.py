@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from nerfstudio.cameras.cameras import Cameras
 
+from nrfgs_ns.data.cameras import LENS
 from nrfgs_ns.data.checks import shown, some
-from nrfgs_ns.data.datamanager import LENS
 from nrfgs_ns.densification import DensificationConfig
 from nrfgs_ns.errors import InputError
 
@@ -75,7 +75,8 @@ def check_data_set(written: Mapping[str, Any], here: Mapping[str, Any], data: ob
         for row, column in changed.nonzero()[:1].tolist():
             was, now = (f"{scene['lenses'][row, column]:g}" for scene in (written, here))
             lens = f"{LENS[column]} of {shown(here['images'][row])} was {was} and is {now}"
-            raise InputError(f"{data}: the checkpoint was trained with other intrinsics ({lens}). {fix}")
+            finding = f"the checkpoint was trained with other intrinsics or --downscale-factor ({lens})"
+            raise InputError(f"{data}: {finding}. {fix}")
 
 
 def check_options(written: Mapping[str, str], here: Mapping[str, str]) -> None:

@@ -5,7 +5,6 @@ import math
 import os
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from importlib import import_module
 from itertools import count
 from pathlib import Path
 from pkgutil import resolve_name
@@ -175,7 +174,7 @@ class NrfgsTrainerConfig(TrainerConfig):
         if (package := TRACKERS.get(name)) is None:
             return
         try:
-            tracker = import_module(package)
+            tracker = resolve_name(package)
             if name == "wandb":
                 tracker.login()
             elif not tracker.get_config("comet.api_key"):

@@ -99,8 +99,7 @@ def surroundings(pipeline) -> tuple[dict[str, Any], bytes]:
     direction.
     """
     model, data = pipeline.model, pipeline.datamanager
-    images = data.cached_train  # before the cameras: undistortion crops them while it loads the images
-    cameras = data.train_dataset.cameras
+    images, cameras = data.cached_train, data.train_dataset.cameras
     starts = []
     for i in evenly_spaced(len(cameras), 8):
         outputs = model.get_outputs_for_camera(cameras[i : i + 1].to(model.device))
