@@ -18,7 +18,6 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs, trans
 from torch import Tensor
 
 from nrfgs_ns.data.checks import matrix, number, shown, some
-from nrfgs_ns.data.sight import MARGIN
 from nrfgs_ns.errors import InputError
 
 PIXELS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
@@ -38,6 +37,8 @@ FARTHEST_CENTER = 10.0
 """Largest distance of the principal point from the image's middle, in image sizes."""
 FISHEYE_AT_LEAST = 1e-12
 """A distortion without effect, because nerfstudio undistorts only where some parameter is not 0."""
+MARGIN = 0.25
+"""Largest displacement of a point by lens distortion, in image sizes."""
 LEFT_OF_IMAGE = 0.25
 """Share of an image's pixels that undistortion must leave."""
 LEAST_FOCAL, MOST_FOCAL = 0.02, 10.0
@@ -252,17 +253,26 @@ def cameras_of(meta: dict[str, Any], lenses: np.ndarray, poses: Tensor, source: 
     return Cameras(poses, fx, fy, cx, cy, width, height, distortion, kind, metadata={})
 
 
-def undistorted_lens(lens: np.ndarray, kind: CameraType) -> tuple[np.ndarray, np.ndarray, np.ndarray, Sequence[int]]:
-    """A photograph's lens as OpenCV undistorts it for nerfstudio, with pixel centres at whole numbers.
+def undistorted_cameras(lenses: Cameras) -> Cameras:
+    """The pinholes [V] that would have taken the undistorted photographs of cameras [V]."""
+    cameras = lenses[torch.arange(len(lenses))]  # a copy of each number, also of one for all
+    cameras.camera_type = torch.full_like(lenses.camera_type, CameraType.PERSPECTIVE.value)
+    cameras.distortion_params = None
+    if (distortion := lenses.distortion_params) is None:
+        return cameras
+    table = torch.cat([*(getattr(lenses, name).float() for name in LENS), distortion], dim=-1).numpy()
+    for index in distortion.any(dim=-1).nonzero()[:, 0].tolist():
+        kind = CameraType(lenses.camera_type[index].item())
+        _, _, flat, (x, y, width, height) = _undistorted(table[index], kind)
+        lens = flat[0, 0], flat[1, 1], flat[0, 2] - x + 0.5, flat[1, 2] - y + 0.5, width, height
+        for name, value in zip(LENS, lens, strict=True):
+            getattr(cameras, name)[index] = float(value)
+    return cameras
 
-    Args:
-        lens: a row of `read_lenses`, [12].
-        kind: one of DRAWN.
 
-    Returns:
-        Its matrix [3, 3], its distortion, the pinhole [3, 3], and the part of that one's image that is kept: x, y,
-        width, height.
-    """
+def _undistorted(lens: np.ndarray, kind: CameraType) -> tuple[np.ndarray, np.ndarray, np.ndarray, Sequence[int]]:
+    """OpenCV's matrix and distortion of a lens [12], with pixel centres at whole numbers; the pinhole [3, 3] of the
+    image as nerfstudio undistorts it, and the part of that which is kept: x, y, width, height."""
     fx, fy, cx, cy, w, h, k1, k2, k3, k4, p1, p2 = lens
     K = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
     size = int(w), int(h)
@@ -277,7 +287,7 @@ def undistorted_lens(lens: np.ndarray, kind: CameraType) -> tuple[np.ndarray, np
 def _check_distortion(lens: np.ndarray, kind: CameraType, where: str) -> None:
     """Check that undistorting leaves enough of the image."""
     fx, fy, _, _, w, h, _, _, _, k4, _, _ = lens
-    K, distortion, flat, part = undistorted_lens(lens, kind)
+    K, distortion, flat, part = _undistorted(lens, kind)
     enough = True
     if kind != CameraType.FISHEYE:
         if k4 != 0:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 import tyro
-from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.configs.dataparser_configs import all_dataparsers
 from nerfstudio.data.datamanagers.full_images_datamanager import (
     FullImageDatamanager,
@@ -29,7 +29,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 from torch import Tensor
 
-from nrfgs_ns.data.cameras import DRAWN, LENS, undistorted_lens
+from nrfgs_ns.data.cameras import LENS, undistorted_cameras
 from nrfgs_ns.data.checks import some, warn
 from nrfgs_ns.data.colmap_parser import checked
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
@@ -99,41 +99,13 @@ class NrfgsInputDataset(InputDataset):
             mask = self._smaller(read_mask(path), image_idx, Image.Resampling.NEAREST, path)
             data["mask"] = torch.from_numpy(np.array(mask)).unsqueeze(-1).bool()
         if (distortion := self.lenses.distortion_params) is not None and distortion[image_idx].any():
-            _undistort(self.lenses, image_idx, data)
+            camera = self.lenses[image_idx].reshape(())
+            K, parameters = camera.get_intrinsics_matrices().numpy(), camera.distortion_params.numpy()
+            _, image, mask = _undistort_image(camera, parameters, data, data["image"].numpy(), K)
+            data["image"] = torch.from_numpy(image)
+            if mask is not None:
+                data["mask"] = mask
         return data
-
-
-def undistorted_cameras(lenses: Cameras) -> Cameras:
-    """The pinholes [V] that would have taken the undistorted photographs of cameras [V]."""
-    cameras = lenses[torch.arange(len(lenses))]  # a copy of each number, also of one for all
-    cameras.camera_type = torch.full_like(lenses.camera_type, CameraType.PERSPECTIVE.value)
-    cameras.distortion_params = None
-    if (distortion := lenses.distortion_params) is None:
-        return cameras
-    table = torch.cat([*(getattr(lenses, name).float() for name in LENS), distortion], dim=-1).numpy()
-    for index in distortion.any(dim=-1).nonzero()[:, 0].tolist():
-        kind = CameraType(lenses.camera_type[index].item())
-        if kind in DRAWN:
-            _, _, K, (x, y, width, height) = undistorted_lens(table[index], kind)
-            lens = K[0, 0], K[1, 1], K[0, 2] - x + 0.5, K[1, 2] - y + 0.5, width, height
-        else:
-            blank = {"image": torch.zeros(*map(int, table[index, [5, 4]]), 3, dtype=torch.uint8)}
-            K = _undistort(lenses, index, blank)
-            lens = K[0, 0], K[1, 1], K[0, 2], K[1, 2], blank["image"].shape[1], blank["image"].shape[0]
-        for name, value in zip(LENS, lens, strict=True):
-            getattr(cameras, name)[index] = float(value)
-    return cameras
-
-
-def _undistort(lenses: Cameras, index: int, data: dict[str, Any]) -> Any:
-    """Undistort the image and the mask of one of the cameras [V] in place; returns the pinhole, [3, 3]."""
-    camera = lenses[index].reshape(())
-    intrinsics, distortion = camera.get_intrinsics_matrices().numpy(), camera.distortion_params.numpy()
-    K, image, mask = _undistort_image(camera, distortion, data, data["image"].numpy(), intrinsics)
-    data["image"] = torch.from_numpy(image)
-    if mask is not None:
-        data["mask"] = mask
-    return K
 
 
 @dataclass

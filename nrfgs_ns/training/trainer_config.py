@@ -25,8 +25,6 @@ from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS, Pace, TimedPace, resolut
 TRAINER = "nrfgs_ns.training.trainer:NrfgsTrainer"
 SEVERAL_DEVICES = "nrfgs_ns.distributed"
 """These import this module."""
-TRACKERS = {"wandb": "wandb", "comet": "comet_ml"}
-"""Packages of the trackers that --vis names."""
 AVERAGED = 200
 """Steps to average in the presets and where the steps are chosen by the views."""
 MOST = 2**32
@@ -168,19 +166,15 @@ class NrfgsTrainerConfig(TrainerConfig):
         CONSOLE.print(f"{self.method_name} on {data or _absolute(parser.data)}", **PLAIN)
 
     def _check_tracker(self) -> None:
-        """Raise InputError where the tracker of `vis` is missing or lacks a key: nerfstudio starts it when the
-        photographs are read. At a terminal wandb asks for the key."""
-        name = self.vis.removeprefix("viewer+")
-        if (package := TRACKERS.get(name)) is None:
-            return
+        """Raise InputError where wandb or comet is missing or lacks a key: nerfstudio starts them when the photographs
+        are read. At a terminal wandb asks for its key."""
         try:
-            tracker = resolve_name(package)
-            if name == "wandb":
-                tracker.login()
-            elif not tracker.get_config("comet.api_key"):
+            if self.is_wandb_enabled():
+                resolve_name("wandb").login()
+            elif self.is_comet_enabled() and not resolve_name("comet_ml").get_config("comet.api_key"):
                 raise ValueError("No API key")
         except Exception as error:  # each has its own
-            fix = f"Run `pip install {package}` and `{name} login`, or give --vis tensorboard."
+            fix = "Install it by pip and log in (`wandb login`, `comet login`), or give --vis tensorboard."
             raise InputError(f"vis is {self.vis}, which cannot start: {str(error).rstrip('.')}. {fix}") from error
 
     def save_config(self) -> None:
