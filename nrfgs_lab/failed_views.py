@@ -32,7 +32,7 @@ def seen_in_training(pipeline) -> Tensor:
     model, cameras = pipeline.model, pipeline.datamanager.train_dataset.cameras
     seen = torch.zeros(4, model.num_points, device=model.device)
     least = torch.full_like(seen[0], torch.inf)
-    for index in range(len(pipeline.datamanager.cached_train)):  # which crops the cameras where lenses distort
+    for index in range(len(cameras)):
         view = model.project(cameras[index : index + 1].to(model.device))
         share = contributions(view.projection, model.field.seen_from(view).opacities)
         x, y = view.projection.means2d.unbind(-1)

@@ -137,7 +137,7 @@ def resampled(config: Path, count: int) -> Capture:
     """A training's splats, thinned, or repeated beside themselves, in sizes that cover as much, and its photographs."""
     pipeline = load_training(config, "inference").pipeline
     table, data = pipeline.model.gauss_params, pipeline.datamanager
-    views = evenly_spaced(len(data.cached_train), VIEWS)  # images before cameras, which they crop
+    views = evenly_spaced(len(data.cached_train), VIEWS)
     draw = torch.Generator().manual_seed(0)
     present = len(table["means"])
     rows = torch.cat([torch.randperm(present, generator=draw) for _ in range(-(-count // present))])[:count]

@@ -255,8 +255,8 @@ def fine_tune(
         where no splat would be left.
     """
     model, data = pipeline.model, pipeline.datamanager
-    view_count = len(data.cached_train)  # before the cameras: undistortion crops them while it loads the images
     cameras = data.train_dataset.cameras
+    view_count = len(cameras)
     noise = ViewNoise(model.noise_factor * camera_spacing(cameras.camera_to_worlds[:, :3, 3]), torch.initial_seed())
     field = model.field.detached()
     # Latents begin as their own principal components.

@@ -18,7 +18,6 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs, trans
 from torch import Tensor
 
 from nrfgs_ns.data.checks import matrix, number, shown, some
-from nrfgs_ns.data.sight import MARGIN
 from nrfgs_ns.errors import InputError
 
 PIXELS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
@@ -28,6 +27,8 @@ UNREAD = ("k5", "k6", "s1", "s2", "s3", "s4", "is_fisheye")
 """OpenCV's larger models, which neither nerfstudio nor we undistort, and instant-ngp's name of a fisheye."""
 DRAWN = (CameraType.PERSPECTIVE, CameraType.FISHEYE)
 """Pinholes, and cameras whose photographs are undistorted to a pinhole's."""
+LENS = ("fx", "fy", "cx", "cy", "width", "height")
+"""Fields of a camera that undistortion changes."""
 SMALLEST, LARGEST = 4, 2**16
 """Pixels of an image along each side."""
 WIDEST, NARROWEST = 0.1, 1e3
@@ -36,6 +37,8 @@ FARTHEST_CENTER = 10.0
 """Largest distance of the principal point from the image's middle, in image sizes."""
 FISHEYE_AT_LEAST = 1e-12
 """A distortion without effect, because nerfstudio undistorts only where some parameter is not 0."""
+MARGIN = 0.25
+"""Largest displacement of a point by lens distortion, in image sizes."""
 LEFT_OF_IMAGE = 0.25
 """Share of an image's pixels that undistortion must leave."""
 LEAST_FOCAL, MOST_FOCAL = 0.02, 10.0
@@ -250,22 +253,46 @@ def cameras_of(meta: dict[str, Any], lenses: np.ndarray, poses: Tensor, source: 
     return Cameras(poses, fx, fy, cx, cy, width, height, distortion, kind, metadata={})
 
 
-def _check_distortion(lens: np.ndarray, kind: CameraType, where: str) -> None:
-    """Check that undistorting leaves enough of the image."""
+def undistorted_cameras(lenses: Cameras) -> Cameras:
+    """The pinholes [V] that would have taken the undistorted photographs of cameras [V]."""
+    cameras = lenses[torch.arange(len(lenses))]  # a copy of each number, also of one for all
+    cameras.camera_type = torch.full_like(lenses.camera_type, CameraType.PERSPECTIVE.value)
+    cameras.distortion_params = None
+    if (distortion := lenses.distortion_params) is None:
+        return cameras
+    table = torch.cat([*(getattr(lenses, name).float() for name in LENS), distortion], dim=-1).numpy()
+    for index in distortion.any(dim=-1).nonzero()[:, 0].tolist():
+        kind = CameraType(lenses.camera_type[index].item())
+        _, _, flat, (x, y, width, height) = _undistorted(table[index], kind)
+        lens = flat[0, 0], flat[1, 1], flat[0, 2] - x + 0.5, flat[1, 2] - y + 0.5, width, height
+        for name, value in zip(LENS, lens, strict=True):
+            getattr(cameras, name)[index] = float(value)
+    return cameras
+
+
+def _undistorted(lens: np.ndarray, kind: CameraType) -> tuple[np.ndarray, np.ndarray, np.ndarray, Sequence[int]]:
+    """OpenCV's matrix and distortion of a lens [12], with pixel centres at whole numbers; the pinhole [3, 3] of the
+    image as nerfstudio undistorts it, and the part of that which is kept: x, y, width, height."""
     fx, fy, cx, cy, w, h, k1, k2, k3, k4, p1, p2 = lens
     K = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
     size = int(w), int(h)
     if kind == CameraType.FISHEYE:
-        flat = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
-            K, np.array([k1, k2, k3, k4]), size, np.eye(3), balance=0
-        )
-        enough = True
-    elif k4 != 0:
-        raise InputError(f"{where} has k4 = {k4:g}, which is for fisheyes. Set it to 0, or undistort the images.")
-    else:
-        parameters = np.array([k1, k2, p1, p2, k3])
-        flat, part = cv2.getOptimalNewCameraMatrix(K, parameters, size, 0)
-        enough = part[2] * part[3] >= LEFT_OF_IMAGE * w * h and not _folds(K, parameters, size, flat, part)
+        distortion = np.array([k1, k2, k3, k4])
+        flat = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(K, distortion, size, np.eye(3), balance=0)
+        return K, distortion, flat, (0, 0, *size)
+    distortion = np.array([k1, k2, p1, p2, k3])
+    return K, distortion, *cv2.getOptimalNewCameraMatrix(K, distortion, size, 0)
+
+
+def _check_distortion(lens: np.ndarray, kind: CameraType, where: str) -> None:
+    """Check that undistorting leaves enough of the image."""
+    fx, fy, _, _, w, h, _, _, _, k4, _, _ = lens
+    K, distortion, flat, part = _undistorted(lens, kind)
+    enough = True
+    if kind != CameraType.FISHEYE:
+        if k4 != 0:
+            raise InputError(f"{where} has k4 = {k4:g}, which is for fisheyes. Set it to 0, or undistort the images.")
+        enough = part[2] * part[3] >= LEFT_OF_IMAGE * w * h and not _folds(K, distortion, (w, h), flat, part)
     change = flat[[0, 1], [0, 1]] / (fx, fy)
     if not (enough and ((LEAST_FOCAL < change) & (change < MOST_FOCAL)).all()):
         raise InputError(f"{where} leaves next to nothing of the image. Correct it, or undistort the photographs.")

@@ -4,18 +4,18 @@ without an accelerator, and to continue after an interruption."""
 
 import hashlib
 import json
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
+from traceback import walk_tb
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 import torch
 import tyro
-from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.configs.dataparser_configs import all_dataparsers
 from nerfstudio.data.datamanagers.full_images_datamanager import (
     FullImageDatamanager,
@@ -29,6 +29,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 from torch import Tensor
 
+from nrfgs_ns.data.cameras import LENS, undistorted_cameras
 from nrfgs_ns.data.checks import some, warn
 from nrfgs_ns.data.colmap_parser import checked
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
@@ -37,8 +38,8 @@ from nrfgs_ns.data.views import different_views, nearest_depth, scene_unit
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import whole
 
-LENS = ("fx", "fy", "cx", "cy", "width", "height")
-"""Fields of a camera that undistortion changes."""
+IMAGES = "image", "mask"
+"""What a photograph has in files."""
 PAGE = 4096
 """Bytes of a page of memory."""
 WITH_POINTS = {"nerfstudio-data": NerfstudioDataParserConfig(load_3D_points=True)}
@@ -59,14 +60,16 @@ class NrfgsInputDataset(InputDataset):
                 option = f"--pipeline.datamanager.camera-res-scale-factor {scale_factor}"
                 raise InputError(f"{option} leaves nothing of the images. Give a larger one.")
             setattr(self.cameras, name, sides.to(getattr(self.cameras, name)))
+        self.lenses = self.cameras
+        """the cameras of the files; `cameras` are the pinholes of the images that `get_data` undistorts"""
+        self.cameras = undistorted_cameras(self.lenses)
         # The datamanager removes entries from the list, which all datasets share.
         self.exclude_batch_keys_from_device = list(self.exclude_batch_keys_from_device)
         self.metadata["scene_unit"] = scene_unit(self.cameras.camera_to_worlds[:, :3, 3])
         self.metadata["different_views"] = different_views(self.cameras.camera_to_worlds)
         if (points := self.metadata.get("points3D_xyz")) is not None:
             self.metadata["nearest_depth"] = nearest_depth(points, self.cameras)
-        # Undistortion crops the cameras while it loads the images.
-        self._sizes = torch.cat([self.cameras.width, self.cameras.height], dim=-1).tolist()
+        self._sizes = torch.cat([self.lenses.width, self.lenses.height], dim=-1).tolist()
         self.downscale = self.metadata.get("downscale", 1)
         """size of the files / size of the cameras; nerfstudio's own parsers do not say it"""
 
@@ -87,13 +90,21 @@ class NrfgsInputDataset(InputDataset):
         return picture if picture.size == tuple(size) else picture.resize(size, sampling)
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
-        """The image, its mask and its index; InputError if a file cannot be used."""
+        """The undistorted "image" [H, W, 3 or 4], "image_idx", and with masks "mask" bool [H, W, 1]; InputError if a
+        file cannot be used."""
         image = self.get_image_float32(image_idx) if image_type == "float32" else self.get_image_uint8(image_idx)
         data = {"image_idx": image_idx, "image": image}
         if (masks := self._dataparser_outputs.mask_filenames) is not None:
             path = masks[image_idx]
             mask = self._smaller(read_mask(path), image_idx, Image.Resampling.NEAREST, path)
             data["mask"] = torch.from_numpy(np.array(mask)).unsqueeze(-1).bool()
+        if (distortion := self.lenses.distortion_params) is not None and distortion[image_idx].any():
+            camera = self.lenses[image_idx].reshape(())
+            K, parameters = camera.get_intrinsics_matrices().numpy(), camera.distortion_params.numpy()
+            _, image, mask = _undistort_image(camera, parameters, data, data["image"].numpy(), K)
+            data["image"] = torch.from_numpy(image)
+            if mask is not None:
+                data["mask"] = mask
         return data
 
 
@@ -128,10 +139,19 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         """reads the next image while this one is trained on"""
         try:
             super().__init__(config, *args, **kwargs)
-        except (OSError, LookupError, AttributeError, AssertionError) as error:  # of nerfstudio's own parsers
+        except (OSError, LookupError, AttributeError, AssertionError, TypeError, ValueError) as error:
+            calls = [frame.f_globals["__name__"] for frame, _ in walk_tb(error.__traceback__)]
+            if not isinstance(error, OSError) and any(name.startswith("nrfgs_ns.") for name in calls[1:]):
+                raise  # only nerfstudio's own parsers raise these for a user's mistake
             finding = f"cannot be read ({type(error).__name__}: {' '.join(str(error).split())})"
             fix = "Check the path in --data or config.yml, and what kind of data set it is."
             raise InputError(f"{config.data or config.dataparser.data} {finding}. {fix}") from error
+
+    @property
+    def evaluated_split(self) -> Literal["test", "training"]:
+        """What evaluations are of: "training" where the data set keeps no image for testing."""
+        trained, evaluated = (set(data.image_filenames) for data in (self.train_dataset, self.eval_dataset))
+        return "training" if evaluated <= trained else "test"
 
     def load_all_images(self) -> None:
         """Decode all images. InputError if an image or a mask cannot be used, or nothing is visible in any training
@@ -173,8 +193,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
 
     def _view(self, index: int) -> Cameras:
         if index not in self._views:
-            self.cached_train  # noqa: B018  (nerfstudio makes train_cameras when it has read, and cropped, the images)
-            camera = self.train_cameras[index : index + 1].to(self.device)
+            camera = self.train_dataset.cameras[index : index + 1].to(self.device)
             camera.metadata = {**(camera.metadata or {}), "cam_idx": index}
             self._views[index] = camera
         return self._views[index]
@@ -206,22 +225,18 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         dataset = self.train_dataset if split == "train" else self.eval_dataset
         storage = self._storage
         kind = self.config.cache_images_type
-        read = from_cache if storage == "files" else undistorted
+        read = partial(from_cache, dataset) if storage == "files" else dataset.get_data
 
         def stored(data: dict[str, Any]) -> dict[str, Any]:
             if torch.device(self.device).type == "cpu" or storage == "files":
                 return data
             move = Tensor.pin_memory if storage == "memory" else lambda values: values.to(self.device)
-            return data | {name: move(data[name]) for name in ("image", "mask") if name in data}
+            return data | {name: move(data[name]) for name in IMAGES if name in data}
 
         sizes = [(dataset.downscale * width, dataset.downscale * height) for width, height in dataset._sizes]
         workers = self.config.max_thread_workers
-        pictures = in_parallel(lambda index: read(dataset, index, kind), sizes, f"Reading {split} images", workers)
-        images = [stored(data) for data in pictures]
-        # Undistorted images are a pinhole's, whatever the lens.
-        dataset.cameras.camera_type = torch.full_like(dataset.cameras.camera_type, CameraType.PERSPECTIVE.value)
-        self.train_cameras = self.train_dataset.cameras.to(self.device if storage == "device" else "cpu")
-        return images
+        pictures = in_parallel(lambda index: read(index, kind), sizes, f"Reading {split} images", workers)
+        return [stored(data) for data in pictures]
 
     def sampling_state(self) -> dict[str, Any]:
         """State of the order of training cameras, of plain numbers, lists and tuples."""
@@ -244,35 +259,15 @@ def _shows_anything(data: dict[str, Any]) -> bool:
 # mask or camera has changed.
 
 
-def undistorted(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
-    """Undistort a photograph; its camera in the data set becomes the pinhole that would have taken it.
-
-    Returns:
-        "image" [H, W, 3 or 4] of `image_type` (uint8 or float32), "image_idx", and with masks "mask" bool [H, W, 1].
-    """
-    data = dataset.get_data(index, image_type=image_type)
-    if (distortion := dataset.cameras.distortion_params) is None or not distortion[index].any():
-        return data
-    camera = dataset.cameras[index].reshape(())
-    intrinsics = camera.get_intrinsics_matrices().numpy()
-    K, image, mask = _undistort_image(camera, camera.distortion_params.numpy(), data, data["image"].numpy(), intrinsics)
-    data["image"] = torch.from_numpy(image)
-    if mask is not None:
-        data["mask"] = mask
-    _set_lens(dataset.cameras, index, (K[0, 0], K[1, 1], K[0, 2], K[1, 2], image.shape[1], image.shape[0]))
-    return data
-
-
 def from_cache(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
-    """`undistorted` from a file that is mapped into memory, and made first if it is missing. Writing to the tensors
-    does not change the file. InputError if there is no room for it."""
+    """`dataset.get_data` from a file that is mapped into memory, and made first if it is missing. Writing to the
+    tensors does not change the file. InputError if there is no room for it."""
     path = _cache_file(dataset, index, image_type)
     try:
         content = torch.load(path, mmap=True, weights_only=True)
     except Exception:  # missing, or cut, as cleaners of caches leave them
-        data = undistorted(dataset, index, image_type)
-        content = {name: data[name].contiguous() for name in ("image", "mask") if name in data}
-        content["lens"] = [getattr(dataset.cameras, name)[index].item() for name in LENS]
+        data = dataset.get_data(index, image_type)
+        content = {name: data[name].contiguous() for name in IMAGES if name in data}
         try:
             with whole(path) as unfinished:
                 torch.save(content, unfinished)
@@ -280,8 +275,7 @@ def from_cache(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
             fix = "Make room, set XDG_CACHE_HOME to another folder, or give more --pipeline.datamanager.image-memory."
             raise InputError(f"{path} cannot be written ({error}). {fix}") from error
         content = torch.load(path, mmap=True, weights_only=True)
-    _set_lens(dataset.cameras, index, content.pop("lens"))
-    return {"image_idx": index, **content}
+    return {"image_idx": index} | {name: content[name] for name in IMAGES if name in content}
 
 
 def read_pages(image: Tensor) -> None:
@@ -291,7 +285,7 @@ def read_pages(image: Tensor) -> None:
 
 def _cache_file(dataset: Any, index: int, image_type: str) -> Path:
     """A photograph's file in the cache, named by a digest of all that its pixels depend on."""
-    outputs, cameras = dataset._dataparser_outputs, dataset.cameras
+    outputs, cameras = dataset._dataparser_outputs, dataset.lenses
     paths = [names[index] for names in (outputs.image_filenames, outputs.mask_filenames) if names is not None]
     files = [(str(path.resolve()), (stat := path.stat()).st_size, stat.st_mtime_ns) for path in paths]
     distortion = None if cameras.distortion_params is None else cameras.distortion_params[index].tolist()
@@ -299,8 +293,3 @@ def _cache_file(dataset: Any, index: int, image_type: str) -> Path:
     inputs = [files, camera, image_type, dataset.scale_factor, str(outputs.alpha_color)]
     name = hashlib.sha256(json.dumps(inputs).encode("utf-8", "surrogateescape")).hexdigest()[:24]
     return cache_folder() / f"{name}.pt"
-
-
-def _set_lens(cameras: Cameras, index: int, lens: Sequence[float]) -> None:
-    for name, value in zip(LENS, lens, strict=True):
-        getattr(cameras, name)[index] = float(value)

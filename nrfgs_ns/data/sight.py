@@ -7,17 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.cameras import Cameras
 
+from nrfgs_ns.data.cameras import undistorted_cameras
 from nrfgs_ns.data.checks import some, warn
+from nrfgs_ns.data.views import in_view
 from nrfgs_ns.errors import InputError
 
 FARTHEST = 1e5
 """Points this many times as far from the cameras' middle as the farthest camera are left out."""
 MOST_POINTS = 10_000
 """Points that are projected, evenly spread over the list."""
-MARGIN = 0.25
-"""Largest displacement of a point by lens distortion, in image sizes."""
 FEWEST_SEEN = 0.01
 """Share of the points that must be in some view."""
 MOST_BLIND = 0.5
@@ -45,7 +45,7 @@ def check_sight(xyz: torch.Tensor, cameras: Cameras, names: Sequence[str], sourc
     """Check that the named training views see enough of the points [N, 3], at different places, and most views some of
     them; a warning names the views without any."""
     points = xyz[:: max(len(xyz) // MOST_POINTS, 1)].float()
-    visible = [_in_view(points, cameras[index]) for index in range(len(names))]
+    visible = [in_view(points, camera)[0] for camera in undistorted_cameras(cameras)]
     blind = [name for name, seen in zip(names, visible, strict=True) if not seen.any()]
     share = torch.stack(visible).any(dim=0).float().mean().item()
     if not share >= FEWEST_SEEN:  # nor without points
@@ -62,17 +62,3 @@ def check_sight(xyz: torch.Tensor, cameras: Cameras, names: Sequence[str], sourc
         raise InputError(f"{finding}: {some(blind)}. {ONE_WORLD}")
     if blind:
         warn(f"{finding}: {some(blind)}. If their poses are wrong, correct them or remove the frames.")
-
-
-def _in_view(points: torch.Tensor, camera: Cameras) -> torch.Tensor:
-    """Whether points [N, 3] are in front of a camera, in its image or within `MARGIN` of it, bool [N]."""
-    rotation, position = camera.camera_to_worlds[:3, :3], camera.camera_to_worlds[:3, 3]
-    x, y, z = ((points - position) @ rotation).unbind(-1)
-    depth = -z
-    if camera.camera_type.item() == CameraType.FISHEYE.value:  # distances in the image are angles
-        off_axis = torch.hypot(x, y)
-        x, y = (value / off_axis.clamp(min=1e-12) * torch.atan2(off_axis, depth) for value in (x, y))
-    else:
-        x, y = x / depth, y / depth
-    u, v = (camera.fx * x + camera.cx) / camera.width, (camera.cy - camera.fy * y) / camera.height
-    return ((u - 0.5).abs() < 0.5 + MARGIN) & ((v - 0.5).abs() < 0.5 + MARGIN) & (depth > 0)

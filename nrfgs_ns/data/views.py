@@ -74,13 +74,24 @@ def nearest_depth(points: Tensor, cameras: Cameras) -> float:
     points = points[:: max(len(points) // 10_000, 1)].float()
     nearest = math.inf
     for camera in cameras:
-        rotation, position = camera.camera_to_worlds[:3, :3], camera.camera_to_worlds[:3, 3]
-        x, y, z = ((points - position) @ rotation).unbind(-1)
-        u, v = camera.fx * x / -z + camera.cx, camera.cy - camera.fy * y / -z
-        depths = -z[(z < 0) & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)]
+        seen, depths = in_view(points, camera)
+        depths = depths[seen]
         if len(depths) > FEWEST_POINTS:
             nearest = min(nearest, depths.quantile(NEAREST_SHARE).item())
     return nearest if nearest < math.inf else 0.0
+
+
+def in_view(points: Tensor, camera: Cameras, share: float = 1.0) -> tuple[Tensor, Tensor]:
+    """Whether points [N, 3] are in the image of a pinhole camera, bool [N], and their depths, [N].
+
+    Args:
+        camera: one, [] or a batch of one, [1].
+        share: of the image's width and height that counts, about its middle; it may be larger than 1.
+    """
+    camera = camera.reshape(()).to(points.device)
+    x, y, z = ((points - camera.camera_to_worlds[:, 3]) @ camera.camera_to_worlds[:, :3]).unbind(-1)
+    u, v = (camera.fx * x / -z + camera.cx) / camera.width, (camera.cy - camera.fy * y / -z) / camera.height
+    return (z < 0) & ((u - 0.5).abs() <= share / 2) & ((v - 0.5).abs() <= share / 2), -z
 
 
 def distinct_places(centers: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.export.options import CompactOptions, PlyOptions, WebOptions
+from nrfgs_ns.export.options import SCENE, CompactOptions, PlyOptions, WebOptions
 from nrfgs_ns.files import check_writable
 from nrfgs_ns.trained.find import NamesTraining
 
@@ -28,12 +28,15 @@ class _Format(NamesTraining):
     report: Path | None = None
     """also write the numbers to this file, as JSON"""
 
-    def checked(self, file: Path) -> Path:
-        """The config.yml; paths that are written at the end are checked."""
+    def checked(self, *files: Path) -> Path:
+        """The config.yml; paths that are written at the end are checked, the format's `files` among them."""
         config = self.config()
-        if self.report is not None:
-            check_writable(self.report, "--report")
-        check_writable(file, "--output")
+        taken = {config.resolve(): "the training's file"}
+        for option, path in (("--report", self.report), *(("--output", file) for file in files)):
+            if path is not None:
+                check_writable(path, option)
+                if (other := taken.setdefault(path.resolve(), option)) != option:
+                    raise InputError(f"{option} {path} would replace {other}. Give each a name of its own.")
         return config
 
 
@@ -79,7 +82,7 @@ class Web(_Format):
             kind = "file" if self.output.is_file() else "folder"
             fix = "Name a file that ends in .html, or a folder that does not."
             raise InputError(f"--output {self.output} is a {kind}. {fix}")
-        config = self.checked(self.output if alone else self.output / "index.html")
+        config = self.checked(*([self.output] if alone else [self.output / name for name in ("index.html", SCENE)]))
         check_compact(self.options)
         from nrfgs_ns.export.web.command import export_web
 

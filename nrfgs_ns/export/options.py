@@ -5,6 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+SCENE = "scene.nrf"
+"""Name of the scene's file in a page's folder."""
+
 
 @dataclass
 class PlyOptions:

@@ -20,13 +20,14 @@ from torch import Tensor
 
 from nrfgs_ns.appearance.head import Field
 from nrfgs_ns.appearance.sh import ShConfig
+from nrfgs_ns.data.views import in_view
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, Similarity, to_capture
 from nrfgs_ns.export.options import PlyOptions
 from nrfgs_ns.files import whole
 from nrfgs_ns.model.harmonics_fit import PlainSplats
 from nrfgs_ns.model.pinholes import pinhole
-from nrfgs_ns.rasterizer import Pinhole, ProjectionOptions, composite_view, project_view
+from nrfgs_ns.rasterizer import ProjectionOptions, composite_view, project_view
 from nrfgs_ns.threads import few_threads
 from nrfgs_ns.trained.loading import finish, load_model, lost, measure_loss
 
@@ -132,20 +133,9 @@ def render_splats(
     """Render a file's splats over a background [3] with this project's rasterizer, [H, W, 3] in [0, 1]."""
     field = Field(ShConfig(degree=3).setup(), splats._asdict())
     planes = (scene_unit * plane for plane in (ProjectionOptions.near_plane, ProjectionOptions.far_plane))
-    view = project_view(field.splats, _pinhole(camera, splats.means.device), ProjectionOptions(rasterize_mode, *planes))
+    pose = camera.camera_to_worlds.reshape(1, 3, 4).to(splats.means.device)
+    view = project_view(field.splats, pinhole(camera, pose, 1), ProjectionOptions(rasterize_mode, *planes))
     return composite_view(view, field.seen_from(view), background.to(splats.means.device))[0]["rgb"]
-
-
-def _pinhole(camera, device: torch.device) -> Pinhole:
-    return pinhole(camera, camera.camera_to_worlds.reshape(1, 3, 4).to(device), 1)
-
-
-def on_screen(means: Tensor, camera) -> Tensor:
-    """Mask [N] of splats whose centres [N, 3] lie within SPARKS_EDGE."""
-    seen = _pinhole(camera, means.device)
-    pixels = (means @ seen.viewmat[0, :3, :3].T + seen.viewmat[0, :3, 3]) @ seen.K[0].T
-    half = pixels.new_tensor((seen.width, seen.height)) / 2
-    return ((pixels[:, :2] - half * pixels[:, 2:]).abs() <= SPARKS_EDGE * half * pixels[:, 2:]).all(dim=1)
 
 
 def pictures_of_file(model, path: Path, placed: Similarity) -> Callable[[Any], dict[str, Tensor]]:
@@ -156,7 +146,7 @@ def pictures_of_file(model, path: Path, placed: Similarity) -> Callable[[Any], d
     how = model.background_color, model.config.rasterize_mode, model.scene_unit
 
     def pictures(camera) -> dict[str, Tensor]:
-        within = on_screen(file.means, camera)
+        within, _ = in_view(file.means, camera, SPARKS_EDGE)
         return {
             "file": render_splats(file, camera, *how),
             "on_screen": render_splats(PlainSplats(*(value[within] for value in file)), camera, *how),

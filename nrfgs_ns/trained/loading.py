@@ -117,7 +117,8 @@ def measure_loss(pipeline, pictures: Callable[[Any], dict[str, Tensor]]) -> dict
         pictures: camera -> images [H, W, 3] by name, one of them "file".
 
     Returns:
-        means over the images, dB, inside their masks: psnr_model, psnr_NAME; loss_db: model minus file; and per_image.
+        means over the images, dB, inside their masks: psnr_model, psnr_NAME; loss_db: model minus file; per_image; and
+        views: "test", or where no image is kept for testing "training".
     """
     from nrfgs_ns.data.pictures import picture_names
     from nrfgs_ns.image.metrics import psnr
@@ -138,7 +139,8 @@ def measure_loss(pipeline, pictures: Callable[[Any], dict[str, Tensor]]) -> dict
                 per_image.append({"image": image, **scores})
             advance()
     means = {key: sum(image[key] for image in per_image) / len(per_image) for key in scores}
-    return {**means, "loss_db": means["psnr_model"] - means["psnr_file"], "per_image": per_image}
+    loss = means["psnr_model"] - means["psnr_file"]
+    return {**means, "loss_db": loss, "views": data.evaluated_split, "per_image": per_image}
 
 
 def finish(lines: Iterable[str], numbers: dict[str, Any], report: Path | None) -> None:
@@ -155,6 +157,6 @@ def lost(numbers: dict[str, Any]) -> str:
     """`measure_loss` in a sentence."""
     count = len(numbers["per_image"])
     loss = numbers["loss_db"]
-    views = "one test view" if count == 1 else f"{count} test views"
+    views = f"one {numbers['views']} view" if count == 1 else f"{count} {numbers['views']} views"
     change = f"{abs(loss):.2f} dB {'lost' if loss > 0 else 'gained'}" if abs(loss) >= 0.005 else "nothing lost"
     return f"PSNR on {views}: model {numbers['psnr_model']:.2f} dB, file {numbers['psnr_file']:.2f} dB ({change})."

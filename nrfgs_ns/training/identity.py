@@ -10,7 +10,8 @@ from typing import Any
 import torch
 from nerfstudio.cameras.cameras import Cameras
 
-from nrfgs_ns.data.checks import some
+from nrfgs_ns.data.cameras import LENS
+from nrfgs_ns.data.checks import shown, some
 from nrfgs_ns.densification import DensificationConfig
 from nrfgs_ns.errors import InputError
 
@@ -27,10 +28,12 @@ NEUTRAL = (
     "pipeline.datamanager.dataparser.data.",
     "pipeline.datamanager.dataparser.colmap_path.",
     "pipeline.datamanager.dataparser.images_path.",
+    "pipeline.datamanager.dataparser.mask_color.",
 )
 """Options in those groups that change no number, or whose images and poses are compared instead."""
 FAR = 0.01
-"""Largest distance that a camera may have moved, as a share of the cameras' extent."""
+"""Largest distance that a camera may have moved, as a share of the cameras' extent, and largest change of a lens, as a
+share of its focal lengths and of the image's size."""
 
 
 def options_of(config: Any) -> dict[str, str]:
@@ -43,12 +46,15 @@ def options_of(config: Any) -> dict[str, str]:
 
 
 def data_set_of(names: list[str], cameras: Cameras) -> dict[str, Any]:
-    """The names of a data set's images, and its camera centres, [V, 3]."""
-    return {"images": names, "centers": cameras.camera_to_worlds[:, :3, 3].detach().cpu().clone()}
+    """The names of a data set's images, and its cameras' centres, [V, 3], and `LENS`, [V, 6]."""
+    centers = cameras.camera_to_worlds[:, :3, 3].detach().cpu().clone()
+    lenses = torch.cat([getattr(cameras, name).double() for name in LENS], dim=-1).cpu()
+    return {"images": names, "centers": centers, "lenses": lenses}
 
 
 def check_data_set(written: Mapping[str, Any], here: Mapping[str, Any], data: object, to_train: bool) -> None:
-    """Raise InputError where a checkpoint was trained on other images, which only a training minds, or other poses."""
+    """Raise InputError where a checkpoint was trained on other images or intrinsics, which only a training minds, or
+    on other poses."""
     fix = "Go on with the data set that it was trained on, or train anew."
     if to_train and written["images"] != here["images"]:
         differ = sorted(set(written["images"]) ^ set(here["images"]))
@@ -63,6 +69,14 @@ def check_data_set(written: Mapping[str, Any], here: Mapping[str, Any], data: ob
     if bool(moved.any()):
         which = some([here["images"][i] for i in moved.nonzero().flatten().tolist()])
         raise InputError(f"{data}: the checkpoint was trained on other poses ({which} elsewhere). {fix}")
+    if to_train and (lenses := written.get("lenses")) is not None:  # older checkpoints have none
+        scales = lenses[:, [0, 1, 4, 5, 4, 5]]  # of a centre the image's size
+        changed = (lenses - here["lenses"]).abs() > FAR * scales
+        for row, column in changed.nonzero()[:1].tolist():
+            was, now = (f"{scene['lenses'][row, column]:g}" for scene in (written, here))
+            lens = f"{LENS[column]} of {shown(here['images'][row])} was {was} and is {now}"
+            finding = f"the checkpoint was trained with other intrinsics or --downscale-factor ({lens})"
+            raise InputError(f"{data}: {finding}. {fix}")
 
 
 def check_options(written: Mapping[str, str], here: Mapping[str, str]) -> None:

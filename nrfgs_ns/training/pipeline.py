@@ -165,8 +165,8 @@ class NrfgsPipeline(VanillaPipeline):
 
         Args:
             step: unused; nerfstudio passes it.
-            get_std: also report deviations, nulls and each image's values (what `ns-eval` writes); without it only
-                numbers, which a tensorboard can show.
+            get_std: also report deviations, nulls, "views" ("test" or "training") and each image's values (what
+                `ns-eval` writes); without it only numbers, which a tensorboard can show.
 
         Returns:
             Means over images of `METRIC_NAMES`; seconds_per_image (rendering alone, without the first image) and its
@@ -195,7 +195,7 @@ class NrfgsPipeline(VanillaPipeline):
         result = means_of(per_image, get_std) | {"seconds_per_image": seconds, "fps": 1.0 / seconds}
         result |= {"splats": self.model.num_splats, "parameter_bytes": self.model.parameter_bytes}
         if get_std:
-            result["per_image"] = per_image
+            result |= {"views": self.datamanager.evaluated_split, "per_image": per_image}
             print_evaluation(result)
         return result
 
@@ -245,12 +245,13 @@ def means_of(per_image: list[dict[str, Any]], with_deviations: bool) -> dict[str
 
 
 def print_evaluation(result: Mapping[str, Any]) -> None:
-    """Print the means over the test views, the worst view, and how to get LPIPS where it is missing."""
+    """Print the means over the views, the worst view, and how to get LPIPS where it is missing."""
     names = [name for name in SHOWN if result.get(name) is not None]
     views = result["per_image"]
     ranked = sorted((view["psnr"], view["image"]) for view in views if view.get("psnr") is not None)
-    title = "One test view: not a mean, and no measure of the whole"
-    CONSOLE.print(title if len(ranked) == 1 else f"Means over {len(ranked)} test views", soft_wrap=True)
+    kind = result["views"]
+    title = f"One {kind} view: not a mean, and no measure of the whole"
+    CONSOLE.print(title if len(ranked) == 1 else f"Means over {len(ranked)} {kind} views", soft_wrap=True)
     table = Table(*(Column(name, justify="right") for name in names))
     table.add_row(*(f"{result[name]:,}" if name == "splats" else f"{result[name]:.4g}" for name in names))
     CONSOLE.print(table)

@@ -78,6 +78,10 @@ class NrfgsTrainerConfig(TrainerConfig):
                 raise InputError(f"{name} is {value}; these methods train without it. Leave it out.")
         positive = math.ulp(0.0)
         data = self.pipeline.datamanager
+        if color := getattr(data.dataparser, "mask_color", None):
+            fix = "Leave it out, or make them transparent and choose --pipeline.model.background-color."
+            name = "pipeline.datamanager.dataparser.mask_color"
+            raise InputError(f"{name} is {color}; masked pixels are not trained on, whatever their colour. {fix}")
         if (order := data.train_cameras_sampling_strategy) != "random":
             name = "pipeline.datamanager.train_cameras_sampling_strategy"
             raise InputError(f"{name} is {order}; these methods draw cameras at random. Leave it out.")
@@ -158,7 +162,20 @@ class NrfgsTrainerConfig(TrainerConfig):
             raise InputError(f"--data {shown(str(data))}: no such file or folder. Check the path.")
         if devices > 1:
             resolve_name(f"{SEVERAL_DEVICES}.launch:prepare")(self)
+        self._check_tracker()
         CONSOLE.print(f"{self.method_name} on {data or _absolute(parser.data)}", **PLAIN)
+
+    def _check_tracker(self) -> None:
+        """Raise InputError where wandb or comet is missing or lacks a key: nerfstudio starts them when the photographs
+        are read. At a terminal wandb asks for its key."""
+        try:
+            if self.is_wandb_enabled():
+                resolve_name("wandb").login()
+            elif self.is_comet_enabled() and not resolve_name("comet_ml").get_config("comet.api_key"):
+                raise ValueError("No API key")
+        except Exception as error:  # each has its own
+            fix = "Install it by pip and log in (`wandb login`, `comet login`), or give --vis tensorboard."
+            raise InputError(f"vis is {self.vis}, which cannot start: {str(error).rstrip('.')}. {fix}") from error
 
     def save_config(self) -> None:
         """Make the training's folder and save config.yml there, with absolute paths; InputError where it cannot be

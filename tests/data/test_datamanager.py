@@ -5,6 +5,8 @@ import threading
 import numpy as np
 import pytest
 import torch
+from nerfstudio.cameras.cameras import CameraType
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
@@ -113,13 +115,25 @@ def test_free_memory_and_small_pictures_bound_the_threads_that_decode(monkeypatc
         list(in_parallel(read, [(12, 9), (9000, 9000)], "Reading"))
 
 
-def test_undistorted_images_can_be_read_again(capture):
-    """Undistortion crops the cameras; the file keeps its size, and the viewer reads it a second time."""
-    capture.meta |= {"k1": 0.3, "fl_x": 12.0, "fl_y": 12.0}
-    data = manager(capture)
-    heights = {cache["image"].shape[0] for cache in data.cached_train}
-    assert heights == {int(data.train_dataset.cameras.height[0])} and heights != {9}
-    assert data.train_dataset[0]["image"].shape == (9, 12, 3)
+@pytest.mark.parametrize("lens", [
+    {"k1": 0.3}, {"k1": -0.2, "k2": 0.03, "k3": 0.01, "p1": 0.01, "p2": -0.02, "cx": 7.0},
+    {"camera_model": "OPENCV_FISHEYE"}, {"camera_model": "OPENCV_FISHEYE", "k1": 0.05, "k4": 0.01, "cy": 3.8},
+])  # fmt: skip
+def test_undistorted_images_and_their_cameras_are_nerfstudios_and_can_be_read_again(capture, lens):
+    """The cameras without an image that is read, as exports and renderings want them."""
+    capture.meta |= {"fl_x": 12.0, "fl_y": 12.0, **lens}
+    capture.add_masks()
+    ours = manager(capture, camera_res_scale_factor=2.0)
+    options = {"dataparser": ours.config.dataparser, "camera_res_scale_factor": 2.0, "cache_images_type": "uint8"}
+    theirs = FullImageDatamanagerConfig(**options).setup(device="cpu")
+    images = theirs.cached_train
+    cameras, wanted = ours.train_dataset.cameras, theirs.train_dataset.cameras
+    for name in ("camera_to_worlds", "fx", "fy", "cx", "cy", "width", "height"):
+        torch.testing.assert_close(getattr(cameras, name), getattr(wanted, name), rtol=1e-6, atol=1e-6)
+    assert (cameras.camera_type == CameraType.PERSPECTIVE.value).all() and cameras.distortion_params is None
+    assert not torch.equal(cameras.fx, ours.train_dataset.lenses.fx)
+    for read in (ours.cached_train, [ours.train_dataset.get_data(index, "uint8") for index in range(len(images))]):
+        torch.testing.assert_close(read, images, rtol=0, atol=0)
 
 
 def next_cameras(data, count: int) -> list[int]:
@@ -150,9 +164,7 @@ def test_images_in_files_are_those_in_memory(capture, tmp_path, monkeypatch, pri
     def loaded(**options):
         data = manager(capture, **options)
         data.load_all_images()
-        sets = (data.train_dataset.cameras, data.eval_dataset.cameras)
-        lenses = [getattr(cameras, name) for cameras in sets for name in ("fx", "fy", "cx", "cy", "width", "height")]
-        return data, [data.cached_train, data.cached_eval, lenses]
+        return data, [data.cached_train, data.cached_eval]
 
     in_memory, expected = loaded()
     assert not (tmp_path / "cache").exists()
@@ -189,6 +201,17 @@ def test_data_of_another_kind_is_told(capture):
     parser = InstantNGPDataParserConfig(data=capture.save().parent)
     with pytest.raises(InputError, match=f"{capture.folder} cannot be read .AssertionError.* what kind of data set"):
         NrfgsDatamanagerConfig(dataparser=parser).setup(device="cpu")
+
+
+@pytest.mark.parametrize("kind", [AttributeError, AssertionError, KeyError, TypeError])
+@pytest.mark.parametrize("place", ["dataparser.check_options", "datamanager.different_views"])
+def test_mistakes_of_our_own_keep_their_traceback(capture, monkeypatch, place, kind):
+    def mistaken(_):
+        raise kind("ours")
+
+    monkeypatch.setattr(f"nrfgs_ns.data.{place.replace('dataparser.', 'dataparser.checks.')}", mistaken)
+    with pytest.raises(kind, match="ours"):
+        manager(capture)
 
 
 def test_no_room_for_files_is_said(capture, tmp_path, monkeypatch):

@@ -53,10 +53,11 @@ def precise(trainer) -> None:
     splats = trainer.pipeline.model.gauss_params
     splats["scales"].data += torch.sin(37.0 * splats["means"].data)  # a round splat has no gradient by its rotation
     data = trainer.pipeline.datamanager
-    data.train_cameras.camera_to_worlds = data.train_cameras.camera_to_worlds.double()
+    cameras = data.train_dataset.cameras
+    cameras.camera_to_worlds = cameras.camera_to_worlds.double()
     for index in range(1, len(data.cached_train), 2):
         data.cached_train[index]["image"] = data.cached_train[index]["image"][:30, :40]
-        data.train_cameras.width[index], data.train_cameras.height[index] = 40, 30
+        cameras.width[index], cameras.height[index] = 40, 30
 
 
 def one_step(options: dict, scene: Path, folder: Path, name: str, prepare=precise) -> None:

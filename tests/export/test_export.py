@@ -230,13 +230,24 @@ def test_the_command_writes_the_splats_and_says_what_was_lost(method, trained, t
 
     numbers = json.loads(report.read_text())
     assert numbers["written"] == len(splats) <= numbers["splats"] and numbers["bytes"] == ours.stat().st_size
-    assert len(numbers["per_image"]) == 2
+    assert len(numbers["per_image"]) == 2 and numbers["views"] == "test"
     assert numbers["loss_db"] == pytest.approx(numbers["psnr_model"] - numbers["psnr_file"])
     if method == "nrfgs-sh":  # nothing is lost but splats below 1/255, and float32's rounding at 16 dB
         assert abs(numbers["loss_db"]) < 0.01
     else:  # the file is nearer to the model than a tenth of the residual, which is worth the gap to the base colours
         assert abs(numbers["loss_db"]) < abs(numbers["psnr_model"] - numbers["psnr_base"])
     assert numbers["exact"] == (method == "nrfgs-sh")
+
+
+def test_training_views_are_called_so(trained, tmp_path, monkeypatch, printed):
+    pipeline = load_model(trained["nrfgs-sh"], "test")
+    pipeline.datamanager.eval_dataset = pipeline.datamanager.train_dataset  # of a capture without test images
+    monkeypatch.setattr(ply, "load_model", lambda *_: pipeline)
+    Ply(trained["nrfgs-sh"], output=tmp_path / "s.ply", report=tmp_path / "report.json").main()
+    assert json.loads((tmp_path / "report.json").read_text())["views"] == "training"
+    assert "PSNR on 8 training views: " in printed()
+    pipeline.get_average_eval_image_metrics(get_std=True)
+    assert "Means over 8 training views" in printed()
 
 
 def test_every_world_holds_the_same_scene(trained, tmp_path):
@@ -329,6 +340,11 @@ def test_mistakes_are_told_in_a_sentence(trained, tmp_path):
         for name, report in (("file/s.html", None), ("s.html", tmp_path / "file" / "report.json")):
             with pytest.raises(InputError, match="cannot be written"):
                 kind(trained["nrfgs"], output=tmp_path / name, report=report).main()
+    for kind, output, report in ((Ply, "s.ply", "a/../s.ply"), (Compact, "s", "s"), (Web, "page", "page/scene.nrf")):
+        with pytest.raises(InputError, match="--output .* would replace --report. Give each a name of its own"):
+            kind(trained["nrfgs"], output=tmp_path / output, report=tmp_path / report).main()
+    with pytest.raises(InputError, match="--output .* would replace the training's file"):
+        Ply(trained["nrfgs"], output=trained["nrfgs"]).main()
     with pytest.raises(InputError, match="the 'sh' head.*nrfgs export ply"):
         Web(trained["nrfgs-sh"], output=tmp_path / "page.html").main()
     lost = tmp_path / "config.yml"

@@ -15,10 +15,11 @@ from short_trainings import command_line, models_of, trained
 from torch.testing import assert_close
 
 from nrfgs_lab.ablation import Inspect
+from nrfgs_ns.data.views import in_view
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Compact, Ply, Web
 from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, Similarity
-from nrfgs_ns.export.ply import on_screen, render_splats
+from nrfgs_ns.export.ply import SPARKS_EDGE, render_splats
 from nrfgs_ns.trained import loading
 from nrfgs_ns.trained.command import View
 from nrfgs_ns.trained.loading import load_training
@@ -111,4 +112,4 @@ def test_on_screen_is_what_sparks_shader_keeps():
     x = torch.tensor([0.0, 1.0, 1.39, 1.41, -1.39, -1.41]) * edge
     means = torch.stack([x, torch.zeros(6), torch.zeros(6)], dim=-1)
     means = torch.cat([means, torch.tensor([[0.0, 0.0, 6.0]])])  # the last is behind
-    assert on_screen(means, camera(NOWHERE)).tolist() == [True, True, True, False, True, False, False]
+    assert in_view(means, camera(NOWHERE), SPARKS_EDGE)[0].tolist() == [True, True, True, False, True, False, False]

@@ -10,7 +10,7 @@ from nrfgs_lab.failed_views import failed_views, seen_in_training
 
 @pytest.mark.usefixtures("no_cuda")
 def test_a_splat_before_a_camera_is_found_and_left_out_and_without_points_nothing_is_near(capture, tmp_path):
-    """Also where lenses distort: by the cameras of the undistorted images, which are known once these are read."""
+    """Also where lenses distort: by the cameras of the undistorted images."""
     capture.meta["k1"] = -0.3
     for near in (True, False):
         if near:

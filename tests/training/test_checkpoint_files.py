@@ -149,11 +149,15 @@ def test_a_writer_that_is_killed_at_any_operation_leaves_whole_files(tmp_path):
     assert 2 <= len(kept) <= 3, "two, and a third while the oldest is being removed"
 
 
-def scene(names=("a.png", "b.png", "c.png"), shift: float = 0.0) -> dict:
+LENS = {"fx": 90.0, "fy": 80.0, "cx": 50.0, "cy": 30.0, "width": 100, "height": 60}
+
+
+def scene(names=("a.png", "b.png", "c.png"), shift: float = 0.0, **lens: float) -> dict:
     poses = torch.eye(4)[None, :3].repeat(len(names), 1, 1)
     poses[:, 0, 3] = torch.arange(len(names))
     poses[1, 1, 3] += shift
-    return data_set_of(list(names), SimpleNamespace(camera_to_worlds=poses))
+    lenses = {name: torch.full((len(names), 1), value) for name, value in (LENS | lens).items()}
+    return data_set_of(list(names), SimpleNamespace(camera_to_worlds=poses, **lenses))
 
 
 @pytest.mark.parametrize(("here", "going_on", "afterwards"), [
@@ -162,9 +166,14 @@ def scene(names=("a.png", "b.png", "c.png"), shift: float = 0.0) -> dict:
     (scene(("a.png", "c.png", "b.png")), "in another order", r"other poses \(c.png, b.png elsewhere\)"),
     (scene(("a.png", "b.png", "new.png"), shift=0.1), r"other images \(c", r"other poses \(b.png elsewhere\)"),
     (scene(shift=0.1), r"other poses \(b.png elsewhere\)", r"other poses \(b.png elsewhere\)"),
+    (scene(fy=81.0), "other intrinsics .* .fy of a.png was 80 and is 81.", None),
+    (scene(cx=52.0), "other intrinsics .* .cx of a.png was 50 and is 52.", None),
+    (scene(width=200), "other intrinsics .* .width of a.png was 100 and is 200.", None),
 ])  # fmt: skip
 def test_another_scene_is_refused(here, going_on, afterwards):
-    check_data_set(scene(), scene(shift=1e-4), "elsewhere", to_train=True)
+    check_data_set(scene(), scene(shift=1e-4, fx=90.8, cx=50.9), "elsewhere", to_train=True)
+    older = {name: value for name, value in scene().items() if name != "lenses"}
+    check_data_set(older, scene(width=200), "elsewhere", to_train=True)
     with pytest.raises(InputError, match=going_on):
         check_data_set(scene(), here, "data/fox", to_train=True)
     with pytest.raises(InputError, match=afterwards) if afterwards else contextlib.nullcontext():

@@ -5,8 +5,10 @@ import math
 import os
 import re
 import signal
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
@@ -185,11 +187,21 @@ def test_a_finished_training_says_so_and_how_to_extend_it(finished, tiny_scene, 
     ("machine.num_devices", 0), ("machine.device_type", "cuda"), ("optimizers.quats.optimizer.lr", -1.0),
     ("optimizers.means.optimizer.lr", 0.0), ("optimizers.quats.optimizer.lr", 1e30), ("mixed_precision", True),
     ("optimizers.means.scheduler.lr_final", 0.0), ("gradient_accumulation_steps", {"means": 2}),
+    ("pipeline.datamanager.dataparser.mask_color", (0.0, 0.0, 1.0)),
 ])  # fmt: skip
 def test_options_without_sense_are_refused(option, bad, tiny_scene):
     config = replace(config_with(option, bad), data=tiny_scene)
     with pytest.raises(InputError, match=re.escape(f"{option} is {bad}")):
         config.print_to_terminal()  # ns-train's first call: nothing is written before it
+
+
+@pytest.mark.parametrize(("vis", "package"), [("wandb", "wandb"), ("viewer+comet", "comet_ml")])
+def test_a_tracker_that_would_not_start_is_told_first(vis, package, tiny_scene, monkeypatch):
+    without_key = SimpleNamespace(login=Mock(side_effect=ValueError("No API key")), get_config=lambda _: None)
+    for module, finding in ((None, f"import of {package}"), (without_key, "No API key")):
+        monkeypatch.setitem(sys.modules, package, module)
+        with pytest.raises(InputError, match=rf"vis is {re.escape(vis)}.*{finding}.*by pip and log in"):
+            replace(config_with("vis", vis), data=tiny_scene).print_to_terminal()
 
 
 def test_a_folder_beyond_the_systems_encoding_and_images_too_small_to_begin_with_are_refused(tiny_scene, tmp_path):

@@ -16,20 +16,17 @@ from PIL import Image
 from nrfgs_ns.appearance.nrf import NeuralResidualField
 from nrfgs_ns.appearance.reduce import branches
 from nrfgs_ns.data.pictures import picture_names
-from nrfgs_ns.data.views import evenly_spaced
+from nrfgs_ns.data.views import evenly_spaced, in_view
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.compact import load_field, write_file
-from nrfgs_ns.export.options import CompactOptions, WebOptions
+from nrfgs_ns.export.options import SCENE, CompactOptions, WebOptions
 from nrfgs_ns.export.web.guide import read_notes, read_tour
 from nrfgs_ns.export.web.page import page
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.image.metrics import psnr
-from nrfgs_ns.model.pinholes import pinhole
 from nrfgs_ns.threads import few_threads
 from nrfgs_ns.trained.loading import finish, lost
 
-SCENE = "scene.nrf"
-"""Name of the scene's file in a folder."""
 POSTER_SIDE = 960
 """Longest side of the poster, pixels."""
 MOST_WEIGHTS = 1024
@@ -101,8 +98,7 @@ def surroundings(pipeline) -> tuple[dict[str, Any], bytes]:
     direction.
     """
     model, data = pipeline.model, pipeline.datamanager
-    images = data.cached_train  # before the cameras: undistortion crops them while it loads the images
-    cameras = data.train_dataset.cameras
+    images, cameras = data.cached_train, data.train_dataset.cameras
     starts = []
     for i in evenly_spaced(len(cameras), 8):
         outputs = model.get_outputs_for_camera(cameras[i : i + 1].to(model.device))
@@ -133,13 +129,8 @@ def surroundings(pipeline) -> tuple[dict[str, Any], bytes]:
 
 def distance(camera: Cameras, means: torch.Tensor) -> float | None:
     """Median depth of the means in the middle of a camera's image, half as wide and high; None if there are none."""
-    seen = pinhole(camera, camera.camera_to_worlds.cpu().reshape(1, 3, 4), 1)
-    points = means @ seen.viewmat[0, :3, :3].T + seen.viewmat[0, :3, 3]
-    pixels = points @ seen.K[0].T
-    pixels = pixels[:, :2] / pixels[:, 2:]
-    size = pixels.new_tensor([seen.width, seen.height])
-    middle = ((pixels / size - 0.5).abs() < 0.25).all(dim=1) & (points[:, 2] > 0)
-    return float(points[middle, 2].median()) if middle.any() else None
+    middle, depths = in_view(means, camera, 0.5)
+    return float(depths[middle].median()) if middle.any() else None
 
 
 def _rounded(values: torch.Tensor) -> list[float]:
