@@ -204,12 +204,12 @@ def test_data_of_another_kind_is_told(capture):
 
 
 @pytest.mark.parametrize("kind", [AttributeError, AssertionError, KeyError, TypeError])
-@pytest.mark.parametrize("place", ["dataparser.check_options", "datamanager.different_views"])
+@pytest.mark.parametrize("place", ["dataparser.checks.check_options", "datamanager.different_views"])
 def test_mistakes_of_our_own_keep_their_traceback(capture, monkeypatch, place, kind):
     def mistaken(_):
         raise kind("ours")
 
-    monkeypatch.setattr(f"nrfgs_ns.data.{place.replace('dataparser.', 'dataparser.checks.')}", mistaken)
+    monkeypatch.setattr(f"nrfgs_ns.data.{place}", mistaken)
     with pytest.raises(kind, match="ours"):
         manager(capture)
 
