@@ -30,7 +30,7 @@ from nrfgs_ns.training.step_graph import StepGraphs
 
 EVERY = 2
 """Steps from one agreement to the next with few training views."""
-VIEWS = 100.0
+VIEWS = 50.0
 """Training views with which agreements are e times as rare."""
 RAREST = 6
 """Steps between agreements from which a twin is not worth its time."""
@@ -92,6 +92,8 @@ class Twin:
             second = model.config.setup(seed_points=model.seed_points, **given).to(model.device)
         second.learn_photographs(deepcopy(model.photograph))
         second.densification.verbose = False
+        if model.device.type == "cuda":
+            second.head.try_kernels(model.device)
         self.pipeline = copy(trainer.pipeline)
         self.pipeline._modules = {**trainer.pipeline._modules, "_model": second}
         self.guard = Guard(self.pipeline)
