@@ -3,12 +3,12 @@
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from statistics import fmean, median
+from statistics import fmean, median, stdev
 
 from scipy.stats import binomtest
 
 from nrfgs_lab.bench.spec import OWN
-from nrfgs_lab.pages.runs import VIEWS, Trainings, grid, mean, records, signed, trainings, view_gains
+from nrfgs_lab.pages.runs import VIEWS, Trainings, bench_rows, grid, mean, records, signed, trainings, view_gains
 
 FIELD, HOST, SAME = "nrfgs", "splatfacto", "harmonics, same rules"
 FEW = list(VIEWS)[1:]
@@ -24,12 +24,49 @@ MADE = {"glossy": "made", "matt": "made_matt"}
 def host(scene: str) -> Trainings:
     """Splatfacto's trainings of a capture: the first in results/captures.json or presets.json, the others with ours."""
     first = [one for one in records("captures").values() if (one.get("scene"), one.get("name")) == (scene, HOST)]
-    return (first or trainings("presets", scene, "nerfstudio_splatfacto", OWN)) + today(scene, HOST)
+    return (first or trainings("presets", scene, "nerfstudio_splatfacto", OWN)) + alone(scene, HOST)
+
+
+def alone(scene: str, name: str, strategy: str = OWN) -> Trainings:
+    """The trainings of a capture with today's settings but for the twin, by seed."""
+    return trainings("default", scene, name.replace(",", "_").replace(" ", "_"), strategy)
 
 
 def today(scene: str, name: str, strategy: str = OWN) -> Trainings:
     """The trainings of a capture with today's settings, by seed."""
-    return trainings("default", scene, name.replace(",", "_").replace(" ", "_"), strategy)
+    return alone(scene, f"{name}, twin", strategy) or alone(scene, name, strategy)
+
+
+def twin_gain(head: str) -> str:
+    """Mean change by a twin on sets of held-out views, with its standard error, and how many sets gain; its time."""
+    pair = {"field": ("twin", "alone"), "harmonics": ("harmonics", "harmonics_alone")}[head]
+    rows = bench_rows("twin")
+    sets = [(rows[place], rows[*place[:2], pair[1]]) for place in rows if place[2] == pair[0]]
+    changes = []
+    for both in sets:
+        (ours,), (theirs,) = (row.records.values() for row in both)
+        tests = [one["measured"]["test"] for one in (ours, theirs)]
+        worst = [min(view["psnr"] for view in test["per_image"]) for test in tests]
+        seconds = ours["train"]["seconds"] / theirs["train"]["seconds"]
+        changes.append((*(tests[0][of] - tests[1][of] for of in ("psnr", "ssim")), worst[0] - worst[1], seconds))
+    psnr, ssim, worst, times = zip(*changes, strict=True)
+    better = f"{sum(one > 0 for one in psnr)} and {sum(one > 0 for one in ssim)} of {len(sets)} sets"
+    gain = f"{signed(fmean(psnr), 2)}±{stdev(psnr) / len(psnr) ** 0.5:.2f} dB, {signed(fmean(ssim), 4)} SSIM ({better})"
+    return f"{gain}, {signed(fmean(worst), 1)} dB in the worst view, {fmean(times):.1f} times the time"
+
+
+def twins() -> str:
+    """Trainings with a twin and without on test views: each seed's PSNR, SSIM, the worst view."""
+    body = []
+    for scene in (scene for scene in VIEWS if alone(scene, f"{FIELD}, twin")):
+        for label, name in (("field", FIELD), ("harmonics", SAME)):
+            cells = []
+            for runs in (alone(scene, name), today(scene, name)):
+                worst = min(view[1] for one in runs for view in one["per_image"])
+                seeds = ", ".join(f"{one['psnr']:.2f}" for one in runs)
+                cells.append(f"{seeds}/{mean(runs, 'ssim'):.3f}/{worst:.1f}")
+            body.append([f"{scene}, {label}", *cells])
+    return grid(["PSNR of three seeds/SSIM/worst view", "alone", "with a twin"], body)
 
 
 def ahead(gains: list[float], digits: int = 1) -> str:
@@ -154,6 +191,8 @@ BLOCKS = {
     "readme.over_same": over_same,
     "readme.demo": demo,
     "captures.rules_gain": rules_gain,
+    "captures.twin": twin_gain,
+    "tables.twin": twins,
     "captures.floaters": floaters,
     "captures.today": lambda *place: _run({of: mean(today(*place), of) for of in ("psnr", "ssim", "splats")}),
     "captures.sparse": sparse,

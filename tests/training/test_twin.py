@@ -53,9 +53,9 @@ def test_few_views_on_a_gpu_have_a_twin(tiny_scene, tmp_path, no_cuda, capsys):
     every = [steps_between(views) for views in (3, 24, 40, 50, 60, 10_000)]
     assert every == sorted(every[:4]) + [0, 0] and every[0] == twin.EVERY
     assert set_up(command_line("nrfgs", tiny_scene, tmp_path / "auto", 1)).twin is None  # on a CPU
-    assert "second training" not in capsys.readouterr().out
+    assert "trained twice" not in capsys.readouterr().out
     ready(tiny_scene, tmp_path / "on")
-    assert "a second training beside it" in capsys.readouterr().out
+    assert "trained twice" in capsys.readouterr().out
 
 
 def test_views_lie_between_neighbouring_cameras(tiny_scene, tmp_path, no_cuda):
