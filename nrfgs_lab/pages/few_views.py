@@ -37,36 +37,34 @@ def today(scene: str, name: str, strategy: str = OWN) -> Trainings:
     return alone(scene, f"{name}, twin", strategy) or alone(scene, name, strategy)
 
 
-def twin_gain(head: str) -> str:
+def twin_gain(trial: str, base: str) -> str:
     """Mean change by a twin on sets of held-out views, with its standard error, and how many sets gain; its time."""
-    pair = {"field": ("twin", "alone"), "harmonics": ("harmonics", "harmonics_alone")}[head]
-    rows = bench_rows("twin")
-    sets = [(rows[place], rows[*place[:2], pair[1]]) for place in rows if place[2] == pair[0]]
-    changes = []
-    for both in sets:
-        (ours,), (theirs,) = (row.records.values() for row in both)
-        tests = [one["measured"]["test"] for one in (ours, theirs)]
-        worst = [min(view["psnr"] for view in test["per_image"]) for test in tests]
-        seconds = ours["train"]["seconds"] / theirs["train"]["seconds"]
-        changes.append((*(tests[0][of] - tests[1][of] for of in ("psnr", "ssim")), worst[0] - worst[1], seconds))
+    rows, changes = bench_rows("twin"), []
+    for scene, strategy, run in rows:
+        if run == trial and (scene, strategy, base) in rows:
+            pair = [next(iter(rows[scene, strategy, name].records.values())) for name in (trial, base)]
+            tests = [one["measured"]["test"] for one in pair]
+            worst = [min(view["psnr"] for view in test["per_image"]) for test in tests]
+            gains = [tests[0][metric] - tests[1][metric] for metric in ("psnr", "ssim")]
+            changes.append([*gains, worst[0] - worst[1], pair[0]["train"]["seconds"] / pair[1]["train"]["seconds"]])
     psnr, ssim, worst, times = zip(*changes, strict=True)
-    better = f"{sum(one > 0 for one in psnr)} and {sum(one > 0 for one in ssim)} of {len(sets)} sets"
-    gain = f"{signed(fmean(psnr), 2)}±{stdev(psnr) / len(psnr) ** 0.5:.2f} dB, {signed(fmean(ssim), 4)} SSIM ({better})"
-    return f"{gain}, {signed(fmean(worst), 1)} dB in the worst view, {fmean(times):.1f} times the time"
+    better = "{} and {} of {} sets".format(*(sum(one > 0 for one in gains) for gains in (psnr, ssim)), len(psnr))
+    gain = f"{signed(fmean(psnr), 2)}±{stdev(psnr) / len(psnr) ** 0.5:.2f} dB, {signed(fmean(ssim), 4)} SSIM"
+    return f"{gain} (better on {better}), worst view {signed(fmean(worst), 1)} dB, {fmean(times):.1f} times the time"
 
 
 def twins() -> str:
     """Trainings with a twin and without on test views: each seed's PSNR, SSIM, the worst view."""
     body = []
     for scene in (scene for scene in VIEWS if alone(scene, f"{FIELD}, twin")):
-        for label, name in (("field", FIELD), ("harmonics", SAME)):
+        for label, name in {"field": FIELD, "harmonics": SAME}.items():
             cells = []
             for runs in (alone(scene, name), today(scene, name)):
                 worst = min(view[1] for one in runs for view in one["per_image"])
                 seeds = ", ".join(f"{one['psnr']:.2f}" for one in runs)
                 cells.append(f"{seeds}/{mean(runs, 'ssim'):.3f}/{worst:.1f}")
             body.append([f"{scene}, {label}", *cells])
-    return grid(["PSNR of three seeds/SSIM/worst view", "alone", "with a twin"], body)
+    return grid(["", "alone", "with a twin"], body)
 
 
 def ahead(gains: list[float], digits: int = 1) -> str:

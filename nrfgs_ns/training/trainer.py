@@ -158,9 +158,9 @@ class NrfgsTrainer(Trainer):
             self.pipeline.model.schedule_at(int(self.pace.position))
         if self.mean is not None and self.mean.is_saved and training.get("parameter_mean") is not None:
             self.mean.load_state(training["parameter_mean"], self.optimizers.optimizers)
-        if self.twin is not None and (saved := training.get("twin")) is not None:
-            self.twin.load_state(saved)
-        elif self.twin is not None:
+        if self.twin is not None and "twin" in training:
+            self.twin.load_state(training["twin"])
+        else:
             self.twin = None
         budget = config.time_budget
         total = f"{self.total_steps:,}" if budget is None else f"as many as fit into {budget:g} minutes"
