@@ -146,7 +146,7 @@ def twin_of(trainer) -> Twin | None:
     model = trainer.pipeline.model
     if (option := model.config.twin) == "off":
         return None
-    every = steps_between(model.num_views)
+    every = model.config.twin_every or steps_between(model.num_views)
     between = Between(trainer.pipeline.datamanager.train_dataset.cameras)
     if option == "auto" and (not every or model.device.type != "cuda" or model.camera_optimizer.config.mode != "off"):
         return None
@@ -196,7 +196,10 @@ def pull(training, view: Cameras, seen: Tensor, step: int) -> Gradients:
     else:
         optimizers.zero_grad_all()
         loss_of(model, model.gauss_params, model.get_outputs(view), batch, True)["main_loss"].backward()
-    parameters = [each for optimizer in optimizers.optimizers.values() for each in parameters_of(optimizer)]
+    names = list(optimizers.optimizers)
+    if model.config.twin_pulls == "splats":
+        names = [name for name in names if name in ("means", "scales", "quats", "opacities", "features_dc")]
+    parameters = [each for name in names for each in parameters_of(optimizers.optimizers[name])]
     # The next graph that runs writes where this one's gradients are.
     return {parameter: parameter.grad.clone() for parameter in parameters if parameter.grad is not None}
 
