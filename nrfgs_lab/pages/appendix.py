@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from statistics import fmean, median, stdev
 
 from nrfgs_lab.bench.spec import OWN
-from nrfgs_lab.pages.few_views import FIELD, SAME, alone, today
+from nrfgs_lab.pages.few_views import FIELD, SAME, today
 from nrfgs_lab.pages.runs import ORIGINAL, VIEWS, Trainings, grid, mean, records, signed
 from nrfgs_lab.pages.speed import RENDERERS, scale_cells
 
@@ -48,8 +48,8 @@ def rivals() -> str:
     """Each densification on test views: the field's mean PSNR, that of the median view, SSIM; harmonics' mean PSNR."""
     rules, body = (OWN, *RIVALS.values()), []
     for scene in VIEWS:
-        field = [(mean(runs, "psnr"), _metrics(runs)) for runs in (alone(scene, FIELD, rule) for rule in rules)]
-        harmonics = "/".join(f"{mean(alone(scene, SAME, rule), 'psnr'):.2f}" for rule in rules)
+        field = [(mean(runs, "psnr"), _metrics(runs)) for runs in (today(scene, FIELD, rule) for rule in rules)]
+        harmonics = "/".join(f"{mean(today(scene, SAME, rule), 'psnr'):.2f}" for rule in rules)
         body.append([scene, *(f"{psnr:.2f}/{cells[3]}/{cells[0]}" for psnr, cells in field), harmonics])
     return grid(["", "`nrfgs`", *RIVALS, "harmonics, these four"], body)
 

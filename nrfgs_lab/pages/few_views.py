@@ -8,7 +8,7 @@ from statistics import fmean, median, stdev
 from scipy.stats import binomtest
 
 from nrfgs_lab.bench.spec import OWN
-from nrfgs_lab.pages.runs import VIEWS, Trainings, bench_rows, grid, mean, records, signed, trainings, view_gains
+from nrfgs_lab.pages.runs import VIEWS, Trainings, bench_rows, grid, mean, records, signed, span, trainings, view_gains
 
 FIELD, HOST, SAME = "nrfgs", "splatfacto", "harmonics, same rules"
 FEW = list(VIEWS)[1:]
@@ -24,47 +24,38 @@ MADE = {"glossy": "made", "matt": "made_matt"}
 def host(scene: str) -> Trainings:
     """Splatfacto's trainings of a capture: the first in results/captures.json or presets.json, the others with ours."""
     first = [one for one in records("captures").values() if (one.get("scene"), one.get("name")) == (scene, HOST)]
-    return (first or trainings("presets", scene, "nerfstudio_splatfacto", OWN)) + alone(scene, HOST)
-
-
-def alone(scene: str, name: str, strategy: str = OWN) -> Trainings:
-    """The trainings of a capture with today's settings but for the twin, by seed."""
-    return trainings("default", scene, name.replace(",", "_").replace(" ", "_"), strategy)
+    return (first or trainings("presets", scene, "nerfstudio_splatfacto", OWN)) + today(scene, HOST)
 
 
 def today(scene: str, name: str, strategy: str = OWN) -> Trainings:
-    """The trainings of a capture with today's settings, by seed."""
-    return alone(scene, f"{name}, twin", strategy) or alone(scene, name, strategy)
+    """The trainings of a capture with today's settings, without a twin, by seed."""
+    return trainings("default", scene, name.replace(",", "_").replace(" ", "_"), strategy)
+
+
+def twins(trial: str, base: str) -> list[list[dict]]:
+    """Pairs of records of a trial with a twin and of one without, on the same held-out views."""
+    rows = bench_rows("twin")
+    places = [place for place in rows if place[2] == trial and (*place[:2], base) in rows]
+    return [[next(iter(rows[(*place[:2], run)].records.values())) for run in (trial, base)] for place in places]
 
 
 def twin_gain(trial: str, base: str) -> str:
-    """Mean change by a twin on sets of held-out views, with its standard error, and how many sets gain; its time."""
-    rows, changes = bench_rows("twin"), []
-    for scene, strategy, run in rows:
-        if run == trial and (scene, strategy, base) in rows:
-            pair = [next(iter(rows[scene, strategy, name].records.values())) for name in (trial, base)]
-            tests = [one["measured"]["test"] for one in pair]
-            worst = [min(view["psnr"] for view in test["per_image"]) for test in tests]
-            gains = [tests[0][metric] - tests[1][metric] for metric in ("psnr", "ssim")]
-            changes.append([*gains, worst[0] - worst[1], pair[0]["train"]["seconds"] / pair[1]["train"]["seconds"]])
-    psnr, ssim, worst, times = zip(*changes, strict=True)
+    """Mean change by a twin over sets of held-out views, with its standard error, and how many sets gain."""
+    changes = []
+    for pair in twins(trial, base):
+        tests = [one["measured"]["test"] for one in pair]
+        worst = [min(view["psnr"] for view in test["per_image"]) for test in tests]
+        changes.append([*(tests[0][metric] - tests[1][metric] for metric in ("psnr", "ssim")), worst[0] - worst[1]])
+    psnr, ssim, worst = zip(*changes, strict=True)
     better = "{} and {} of {} sets".format(*(sum(one > 0 for one in gains) for gains in (psnr, ssim)), len(psnr))
     gain = f"{signed(fmean(psnr), 2)}±{stdev(psnr) / len(psnr) ** 0.5:.2f} dB, {signed(fmean(ssim), 4)} SSIM"
-    return f"{gain} (better on {better}), worst view {signed(fmean(worst), 1)} dB, {fmean(times):.1f} times the time"
+    return f"{gain} (better on {better}), {signed(fmean(worst), 1)} dB in the worst view"
 
 
-def twins() -> str:
-    """Trainings with a twin and without on test views: each seed's PSNR, SSIM, the worst view."""
-    body = []
-    for scene in (scene for scene in VIEWS if alone(scene, f"{FIELD}, twin")):
-        for label, name in {"field": FIELD, "harmonics": SAME}.items():
-            cells = []
-            for runs in (alone(scene, name), today(scene, name)):
-                worst = min(view[1] for one in runs for view in one["per_image"])
-                seeds = ", ".join(f"{one['psnr']:.2f}" for one in runs)
-                cells.append(f"{seeds}/{mean(runs, 'ssim'):.3f}/{worst:.1f}")
-            body.append([f"{scene}, {label}", *cells])
-    return grid(["", "alone", "with a twin"], body)
+def twin_time() -> str:
+    """Least and most that the seconds of a training grow by a twin, of pairs in one sitting."""
+    pairs = [*twins("twin", "alone"), *twins("harmonics", "harmonics_alone")]
+    return span([one["train"]["seconds"] / other["train"]["seconds"] for one, other in pairs], "{:.1f}".format)
 
 
 def ahead(gains: list[float], digits: int = 1) -> str:
@@ -190,7 +181,7 @@ BLOCKS = {
     "readme.demo": demo,
     "captures.rules_gain": rules_gain,
     "captures.twin": twin_gain,
-    "tables.twin": twins,
+    "captures.twin_time": twin_time,
     "captures.floaters": floaters,
     "captures.today": lambda *place: _run({of: mean(today(*place), of) for of in ("psnr", "ssim", "splats")}),
     "captures.sparse": sparse,

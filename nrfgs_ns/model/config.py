@@ -46,10 +46,6 @@ class NrfgsModelConfig(ModelConfig):
     twin: Literal["auto", "on", "off"] = "off"
     """train a second model beside the first, with which it must agree between the cameras. auto: on a GPU, where views
     are few (docs/captures.md)"""
-    twin_every: int = 0
-    """steps from one agreement with the twin to the next; 0: by the number of views"""
-    twin_pulls: Literal["all", "splats"] = "all"
-    """what agreements change: all parameters, or what all heads' splats have"""
     near_plane: Literal["auto", "off"] = "off"
     """auto: draw nothing nearer than half the depth of the capture's nearest points (docs/captures.md). off: nothing
     nearer than 0.01 scene units, as in splatfacto"""

@@ -22,12 +22,13 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from nrfgs_ns.data.views import camera_spacing
-from nrfgs_ns.errors import InputError
 from nrfgs_ns.model.loss import loss_of
 from nrfgs_ns.training.guard import Guard
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
 from nrfgs_ns.training.step_graph import StepGraphs
 
+START = 6_000
+"""Step of the schedules from which trainings agree; the resolution must be full, too."""
 EVERY = 2
 """Steps from one agreement to the next with few training views."""
 VIEWS = 50.0
@@ -38,6 +39,9 @@ NEIGHBOURS = 4
 """Training cameras that count as neighbours of one."""
 TURN = 3.0
 """Distances between neighbouring cameras that count as much as turning around by one radian."""
+PULLED = "means", "scales", "quats", "opacities", "features_dc"
+"""Tensors that agreements change where the head has a network. The head's own tensors learn from photographs alone,
+since two networks would drift in colour together; harmonics do not (results/twin.json)."""
 JITTER = 0.25
 """Standard deviation of a view's distance from the line between two cameras, in distances between neighbours."""
 
@@ -57,7 +61,8 @@ class Between:
         self.spacing = camera_spacing(centers)
         places = torch.cat([centers / max(self.spacing, 1e-12), TURN * backward], dim=1)
         distances = torch.cdist(places, places).fill_diagonal_(math.inf)
-        self.neighbours = distances.topk(min(NEIGHBOURS, len(cameras) - 1), largest=False).indices.tolist()
+        count = max(min(NEIGHBOURS, len(cameras) - 1), 1)
+        self.neighbours = distances.topk(count, largest=False).indices.tolist()
 
     def draw(self, random: Random) -> Cameras:
         """A view between a camera and one of its neighbours, with the first one's lens. [1], in host memory."""
@@ -83,15 +88,16 @@ class Twin:
 
     world_size = 1
 
-    def __init__(self, trainer, every: int, between: Between):
-        self.first, self.every, self.between = trainer, every, between
-        model = trainer.pipeline.model
+    def __init__(self, trainer, every: int):
+        self.first, self.every, model = trainer, every, trainer.pipeline.model
+        self.between = Between(trainer.pipeline.datamanager.train_dataset.cameras)
         given = {"scene_box": model.scene_box, "num_train_data": model.num_train_data, **model.kwargs}
         with torch.random.fork_rng():
             torch.manual_seed(model._seed + 1)
             second = model.config.setup(seed_points=model.seed_points, **given).to(model.device)
         second.learn_photographs(deepcopy(model.photograph))
         second.densification.verbose = False
+        model.densification.trainings = second.densification.trainings = 2
         if model.device.type == "cuda":
             second.head.try_kernels(model.device)
         self.pipeline = copy(trainer.pipeline)
@@ -115,7 +121,7 @@ class Twin:
             model.densification.reschedule(lambda position: pace.step_at(position, step))
         self._call_back(step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
         pulls: list[Gradients] = [{}, {}]
-        if step % self.every == 0 and first._get_downscale_factor() == 1:
+        if step % self.every == 0 and first.schedule_step >= START and first._get_downscale_factor() == 1:
             view = self.between.draw(Random(f"{first._seed} {step}"))
             pictures = picture(model, view), picture(first, view)
             pulls = [pull(each, view, seen, step) for each, seen in zip((self.first, self), pictures, strict=True)]
@@ -143,18 +149,12 @@ class Twin:
 
 def twin_of(trainer) -> Twin | None:
     """The twin that a trainer's configuration asks for (`NrfgsModelConfig.twin`), if any."""
-    model = trainer.pipeline.model
-    if (option := model.config.twin) == "off":
-        return None
-    every = model.config.twin_every or steps_between(model.num_views)
-    between = Between(trainer.pipeline.datamanager.train_dataset.cameras)
-    if option == "auto" and (not every or model.device.type != "cuda" or model.camera_optimizer.config.mode != "off"):
-        return None
-    if between.spacing == 0.0:
-        if option == "auto":
-            return None
-        raise InputError("pipeline.model.twin is on, but all cameras stand at one place. Leave it out.")
-    return Twin(trainer, every or RAREST, between)
+    model, config = trainer.pipeline.model, trainer.config
+    every = steps_between(model.num_views)
+    is_long = config.time_budget is None and (config.schedule_steps or config.max_num_iterations) > START
+    suits = every > 0 and is_long and model.device.type == "cuda" and model.camera_optimizer.config.mode == "off"
+    is_wanted = model.config.twin == "on" or model.config.twin == "auto" and suits
+    return Twin(trainer, every or RAREST) if is_wanted else None
 
 
 def steps_between(views: int) -> int:
@@ -196,10 +196,8 @@ def pull(training, view: Cameras, seen: Tensor, step: int) -> Gradients:
     else:
         optimizers.zero_grad_all()
         loss_of(model, model.gauss_params, model.get_outputs(view), batch, True)["main_loss"].backward()
-    names = list(optimizers.optimizers)
-    if model.config.twin_pulls == "splats":
-        names = [name for name in names if name in ("means", "scales", "quats", "opacities", "features_dc")]
-    parameters = [each for name in names for each in parameters_of(optimizers.optimizers[name])]
+    names = PULLED if "field" in optimizers.optimizers else optimizers.optimizers
+    parameters = [p for name in names for p in parameters_of(optimizers.optimizers[name])]
     # The next graph that runs writes where this one's gradients are.
     return {parameter: parameter.grad.clone() for parameter in parameters if parameter.grad is not None}
 
