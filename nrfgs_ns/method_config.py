@@ -40,6 +40,7 @@ HALF_A_SPACING = 0.5
 SUITED = {
     "densification": ErrorGuided(),
     "dense_start": "auto",
+    "twin": "auto",
     "near_plane": "auto",
     "view_noise": HALF_A_SPACING,
     "shrinkage": 3.0,  # halved with every 12 training views
@@ -106,7 +107,7 @@ nrfgs_fast = preset(
     "nrfgs-fast",
     nrfgs,
     "nrfgs in 10,000 steps, for a first result (docs/speed.md).",
-    model={},
+    model={"twin": "off"},
     max_num_iterations=FEWEST_STEPS,
     schedule_steps=STEPS,
     average_steps=AVERAGED,

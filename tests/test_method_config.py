@@ -87,7 +87,8 @@ def test_everything_else_is_splatfactos(name):
 
 
 @pytest.mark.parametrize("name, differs", [
-    ("nrfgs-fast", {"max_num_iterations": 10_000, "schedule_steps": 30_000, "average_steps": 200}),
+    ("nrfgs-fast", {"max_num_iterations": 10_000, "schedule_steps": 30_000, "average_steps": 200,
+                    "pipeline.model.twin": "off"}),
     ("nrfgs-best", {"max_num_iterations": 30_000, "average_steps": 200,
                     "pipeline.model.densification": "error-guided,threshold=0.0016"}),
 ])  # fmt: skip
@@ -100,7 +101,7 @@ def test_a_preset_differs_in_what_it_says_and_shares_nothing(name, differs):
 
 def test_harmonics_have_all_rules_that_are_not_the_fields():
     ours, field, plain = (dict(leaves(method.config)) for method in (menu.nrfgs_harmonics, menu.nrfgs, menu.nrfgs_sh))
-    names = "densification", "dense_start", "near_plane", "view_noise", "shrinkage"
+    names = "densification", "dense_start", "twin", "near_plane", "view_noise", "shrinkage"
     rules = {"max_num_iterations", *(f"pipeline.model.{name}" for name in names)}
     assert {key for key in ours if str(ours[key]) != str(plain[key])} == {"method_name", *rules}
     assert all(str(ours[key]) == str(field[key]) for key in rules)

@@ -3,12 +3,12 @@
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from statistics import fmean, median
+from statistics import fmean, median, stdev
 
 from scipy.stats import binomtest
 
 from nrfgs_lab.bench.spec import OWN
-from nrfgs_lab.pages.runs import VIEWS, Trainings, grid, mean, records, signed, trainings, view_gains
+from nrfgs_lab.pages.runs import VIEWS, Trainings, bench_rows, grid, mean, records, signed, span, trainings, view_gains
 
 FIELD, HOST, SAME = "nrfgs", "splatfacto", "harmonics, same rules"
 FEW = list(VIEWS)[1:]
@@ -28,8 +28,34 @@ def host(scene: str) -> Trainings:
 
 
 def today(scene: str, name: str, strategy: str = OWN) -> Trainings:
-    """The trainings of a capture with today's settings, by seed."""
+    """The trainings of a capture with today's settings, without a twin, by seed."""
     return trainings("default", scene, name.replace(",", "_").replace(" ", "_"), strategy)
+
+
+def twins(trial: str, base: str) -> list[list[dict]]:
+    """Pairs of records of a trial with a twin and of one without, on the same held-out views."""
+    rows = bench_rows("twin")
+    places = [place for place in rows if place[2] == trial and (*place[:2], base) in rows]
+    return [[next(iter(rows[(*place[:2], run)].records.values())) for run in (trial, base)] for place in places]
+
+
+def twin_gain(trial: str, base: str) -> str:
+    """Mean change by a twin over sets of held-out views, with its standard error, and how many sets gain."""
+    changes = []
+    for pair in twins(trial, base):
+        tests = [one["measured"]["test"] for one in pair]
+        worst = [min(view["psnr"] for view in test["per_image"]) for test in tests]
+        changes.append([*(tests[0][metric] - tests[1][metric] for metric in ("psnr", "ssim")), worst[0] - worst[1]])
+    psnr, ssim, worst = zip(*changes, strict=True)
+    better = "{} and {} of {} sets".format(*(sum(one > 0 for one in gains) for gains in (psnr, ssim)), len(psnr))
+    gain = f"{signed(fmean(psnr), 2)}±{stdev(psnr) / len(psnr) ** 0.5:.2f} dB, {signed(fmean(ssim), 4)} SSIM"
+    return f"{gain} (better on {better}), {signed(fmean(worst), 1)} dB in the worst view"
+
+
+def twin_time() -> str:
+    """Least and most that the seconds of a training grow by a twin, of pairs in one sitting."""
+    pairs = [*twins("twin", "alone"), *twins("harmonics", "harmonics_alone")]
+    return span([one["train"]["seconds"] / other["train"]["seconds"] for one, other in pairs], "{:.1f}".format)
 
 
 def ahead(gains: list[float], digits: int = 1) -> str:
@@ -154,6 +180,8 @@ BLOCKS = {
     "readme.over_same": over_same,
     "readme.demo": demo,
     "captures.rules_gain": rules_gain,
+    "captures.twin": twin_gain,
+    "captures.twin_time": twin_time,
     "captures.floaters": floaters,
     "captures.today": lambda *place: _run({of: mean(today(*place), of) for of in ("psnr", "ssim", "splats")}),
     "captures.sparse": sparse,

@@ -150,6 +150,8 @@ class Densification(ABC):
     """Number of pixels of the largest photograph."""
     gradients: Literal["none", "signed", "absolute"] = "none"
     """Screen-space gradients that it needs until it rests; absolute: sums over pixels of absolute values (AbsGS)."""
+    trainings: int = 1
+    """Trainings that grow in the same memory at once."""
     moved_at: int | None = None
     """Last step at which rows of the table came to denote other splats although no tensor was replaced."""
 
@@ -242,7 +244,8 @@ class Densification(ABC):
         allowed = self.minimum_of_devices(memory.allowed(splats["means"].device))
         if self.state[GROWTH_LIMIT] is None or self.state[GROWTH_LIMIT][1] != allowed:
             later_pixels = max(self.pixels - info["width"] * info["height"], 0)
-            most = self.minimum_of_devices(memory.most_splats(splats, optimizers, later_pixels))
+            room = memory.most_splats(splats, optimizers, later_pixels) - count
+            most = self.minimum_of_devices(count + room // self.trainings)
             if self.minimum_of_devices(most - count - wanted) >= 0:
                 return wanted
             largest_count = -self.minimum_of_devices(-count)

@@ -10,7 +10,9 @@ from torch import Tensor
 from nrfgs_ns.image.ssim import photometric_loss
 
 
-def loss_of(model, splats: Mapping[str, Tensor], outputs: Mapping[str, Any], batch: Mapping[str, Any]):
+def loss_of(
+    model, splats: Mapping[str, Tensor], outputs: Mapping[str, Any], batch: Mapping[str, Any], is_between: bool = False
+) -> dict[str, Tensor]:
     """The terms of one rendered camera's loss, scalars by name; a step descends their sum.
 
     Terms that are zero in this step are left out. Nothing waits for the GPU.
@@ -20,9 +22,10 @@ def loss_of(model, splats: Mapping[str, Tensor], outputs: Mapping[str, Any], bat
         splats: the rendered table, whose tensors get gradients.
         outputs: "rgb" [H, W, 3] in [0, 1] and "background" [H, W, 3], as rendered.
         batch: the datamanager's "image", and "mask" if there is one.
+        is_between: the image is a twin's picture (`training/twin.py`), whose loss has only the photometric term, too.
     """
     losses = {"main_loss": photometric(model, outputs, batch)}
-    if model.training:
+    if model.training and not is_between:
         model.camera_optimizer.get_loss_dict(losses)
         losses |= model.densification.regularisation(splats) | shrinkage(model, splats)
     return losses

@@ -181,7 +181,7 @@ class NrfgsModel(ExportedModel):
 
     def pinhole(self, camera: Cameras) -> Pinhole:
         """The camera for the rasterizer; training cameras whose pose is not learnt are converted once."""
-        if not self.training:
+        if not self.training or "between" in (camera.metadata or {}):
             return self.pinholes.of_full_size(camera, self.device)
         index = (camera.metadata or {}).get("cam_idx")
         downscale = self._get_downscale_factor()

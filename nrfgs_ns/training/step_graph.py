@@ -194,7 +194,7 @@ class StepGraphs:
 
 def _kind(batch: Mapping[str, Any]) -> tuple:
     """The properties of a photograph for which its graph is recorded."""
-    return tuple(batch["image"].shape), "mask" in batch
+    return tuple(batch["image"].shape), "mask" in batch, "between" in batch
 
 
 class _StepGraph:
@@ -218,6 +218,7 @@ class _StepGraph:
         matrices = {name: getattr(pinhole, name).clone() for name in ("viewmat", "K", "center")}
         self.pinhole = pinhole._replace(**matrices)
         self.batch = {name: batch[name].to(device, copy=True) for name in ("image", "mask") if name in batch}
+        self.is_between = "between" in batch
         self.room = FixedRoom(pairs, device)
         self._counted = torch.ones(2, dtype=torch.int64, pin_memory=True)
         self._arrived = torch.cuda.Event()
@@ -280,7 +281,7 @@ class _StepGraph:
             view = project_view(splats, self.pinhole, replace(model.projection_options, every_row=True))
             noisy = Field(head, model.view_noise.moved(splats, self.noise))
             outputs, info = model.render_view(view, noisy, look)
-            losses = loss_of(model, splats, outputs, self.batch)
+            losses = loss_of(model, splats, outputs, self.batch, self.is_between)
             sum(losses.values()).backward()
         self.gradients = {name: leaf.grad for name, leaf in leaves.items()}
         if shot is not None:

@@ -8,7 +8,6 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from functools import reduce
 from shlex import quote
 from typing import Any, Literal
 
@@ -36,6 +35,7 @@ from nrfgs_ns.training.progress import ProgressLine, end_earlier_logs
 from nrfgs_ns.training.step_graph import StepGraphs
 from nrfgs_ns.training.stopping import StopRequest, heard_signals, is_out_of_memory, rows_agree
 from nrfgs_ns.training.trainer_config import NrfgsTrainerConfig, report_choices
+from nrfgs_ns.training.twin import Twin, descend, twin_of
 
 NOTHING_TO_SAVE = "Stopped before the first step; there is nothing to save."
 
@@ -50,6 +50,7 @@ class NrfgsTrainer(Trainer):
         steps_are_chosen: whether the number of training views decides how many steps there are.
         mean: the parameters' mean over the last steps; None without `average_steps`.
         graphs: recorded steps; None with several devices.
+        twin: a second training to agree with; None: none.
     """
 
     def __init__(self, config: NrfgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
@@ -63,6 +64,7 @@ class NrfgsTrainer(Trainer):
         self.pace: Pace | None = None
         self.mean: ParameterMean | None = None
         self.graphs: StepGraphs | None = None
+        self.twin: Twin | None = None
         self._saved_step: int | None = None
 
     @property
@@ -94,7 +96,9 @@ class NrfgsTrainer(Trainer):
         if self.world_size == 1:
             self.graphs = StepGraphs(self.pipeline.model, self.pipeline.datamanager, self.guard)
         if comms.is_main_process():
-            report_choices(self.config, self.pipeline, self.steps_are_chosen)
+            report_choices(self.config, self.pipeline, self.steps_are_chosen, self.twin is not None)
+        if self.twin is not None:
+            self.twin.begin()
         if self.config.average_steps > 0:  # after the callbacks that change parameters
             self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._average))
 
@@ -113,6 +117,7 @@ class NrfgsTrainer(Trainer):
         self.guard = Guard(self.pipeline)
         self.mean = ParameterMean() if self.config.average_steps > 0 else None
         self.pace = self.config.pace()
+        self.twin = twin_of(self)
         groups = self.pipeline.get_param_groups()
         return LeanOptimizers(self.optimizer_configs(), groups, self.config.logging.steps_per_log, self.pace)
 
@@ -153,6 +158,10 @@ class NrfgsTrainer(Trainer):
             self.pipeline.model.schedule_at(int(self.pace.position))
         if self.mean is not None and self.mean.is_saved and training.get("parameter_mean") is not None:
             self.mean.load_state(training["parameter_mean"], self.optimizers.optimizers)
+        if self.twin is not None and "twin" in training:
+            self.twin.load_state(training["twin"])
+        else:
+            self.twin = None
         budget = config.time_budget
         total = f"{self.total_steps:,}" if budget is None else f"as many as fit into {budget:g} minutes"
         CONSOLE.print(f"Going on from {path}, at step {self._start_step} of {total}.", markup=False, soft_wrap=True)
@@ -217,15 +226,9 @@ class NrfgsTrainer(Trainer):
             pace.begin_step()
             model.densification.reschedule(lambda position: pace.step_at(position, step))
         with self._last_good_state_on_disk():
-            self.guard.begin(step, optimizers, settled_later=self.graphs is not None)
-            optimizers.zero_grad_all()
+            pull = {} if self.twin is None else self.twin.make_step(step)
             is_logged = step % self.config.logging.steps_per_log == 0
-            _, losses, metrics = self.pipeline.get_train_loss_dict(step, self.graphs, is_logged)
-            loss = reduce(torch.add, losses.values())
-            if loss.requires_grad:  # a recorded step has made its gradients already
-                loss.backward(torch.full_like(loss, 1.0 / self.world_size))  # the mean of the devices' losses
-            self.guard.before_optimizers(optimizers)
-            optimizers.step()
+            loss, losses, metrics = descend(self, step, pull, is_logged)
             optimizers.scheduler_step_all(step)
         self._completed_step = step
         if pace is not None:
@@ -322,7 +325,8 @@ class NrfgsTrainer(Trainer):
         gc.collect()
         torch.cuda.empty_cache()  # nothing without CUDA
         model = self.pipeline.model
-        if not rows_agree(model.gauss_params, self.optimizers.optimizers, model.densification.state.values()):
+        pairs = [(model, self.optimizers), *([(self.twin.pipeline.model, self.twin.optimizers)] if self.twin else [])]
+        if not all(rows_agree(m.gauss_params, o.optimizers, m.densification.state.values()) for m, o in pairs):
             return f"Splats were being added or removed, so that nothing could be saved. {kept}"
         try:
             return f"Step {self._completed_step} is saved. {self._save_once()}."
@@ -385,6 +389,8 @@ class NrfgsTrainer(Trainer):
             training["pace"] = self.pace.state()
         if self.mean is not None and self.mean.is_saved and self.mean.count > 0:
             training["parameter_mean"] = self.mean.state()
+        if self.twin is not None:
+            training["twin"] = self.twin.state()
         return {
             "step": step,
             "pipeline": self.pipeline.state_dict(),

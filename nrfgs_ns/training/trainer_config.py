@@ -206,7 +206,7 @@ def _absolute(path: Path | None) -> Path | None:
     return None if path is None else Path(path).absolute()
 
 
-def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool) -> None:
+def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool, has_twin: bool) -> None:
     """Say what was chosen automatically."""
     model, data = pipeline.model, pipeline.datamanager.train_dataset
     views, given = model.num_views, model.num_train_data
@@ -214,6 +214,7 @@ def report_choices(config: NrfgsTrainerConfig, pipeline, steps_are_chosen: bool)
     parts += [f"view dependence reduced to {model.trust:.2g}, as suits few views"] if model.trust < FEW else []
     added = 0 if model.seed_points is None else len(model.seed_points[0]) - len(data.metadata["points3D_xyz"])
     parts += [f"{added:,} points from the photographs"] if added > 0 else []
+    parts += ["trained twice, to agree between the cameras (--pipeline.model.twin off)"] if has_twin else []
     near = model.projection_options.near_plane
     parts += [f"nothing drawn nearer than {near / model.scene_unit:.2g} scene units"] if near == model.near else []
     words = f"{given} training view{'s' * (given != 1)}"

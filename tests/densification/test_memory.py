@@ -86,7 +86,9 @@ def test_a_far_estimate_bounds_a_refinement_alone(monkeypatch, capsys):
     """Of several devices the one with the most splats says whether the limit is near."""
     table, rules = Table(40), strategy("error-guided")
     monkeypatch.setattr(memory, "most_splats", lambda *_: 50)
-    assert rules.room_for(REFINES, table.info(), table.splats, table.optimizers, 30) == 10
+    for trainings in (2, 1):
+        rules.trainings = trainings
+        assert rules.room_for(REFINES, table.info(), table.splats, table.optimizers, 30) == 10 // trainings
     assert rules.state[GROWTH_LIMIT] is None and not capsys.readouterr().out
     monkeypatch.setattr(rules, "minimum_of_devices", lambda n: n - 8 if n < 0 else n)  # another has 48
     assert rules.room_for(REFINES, table.info(), table.splats, table.optimizers, 30) == 10

@@ -36,7 +36,7 @@ def build(tiny_scene, tmp_path):
 def test_a_photograph_of_one_size_too_many_has_no_graph_and_it_is_said(build, monkeypatch):
     pipeline, graphs = build("cpu")
     assert graphs._obstacle({"image": torch.zeros(5, 4, 3)}) is None
-    graphs._graphs = {((height, 4, 3), False): None for height in range(5, 5 + MOST_SIZES)}
+    graphs._graphs = {((height, 4, 3), False, False): None for height in range(5, 5 + MOST_SIZES)}
     assert graphs._obstacle({"image": torch.zeros(5, 4, 3)}) is None
     assert "many sizes" in graphs._obstacle({"image": torch.zeros(4, 4, 3)})
     pipeline.model.step = 29_000  # growth has ended

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A second training, with which the first agrees between the cameras."""
+
+from random import Random
+from types import SimpleNamespace
+
+import pytest
+import torch
+from short_trainings import REFINING, assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
+from torch.testing import assert_close
+
+from nrfgs_ns.image.ssim import photometric_loss
+from nrfgs_ns.training import twin
+from nrfgs_ns.training.checkpoint_files import read_latest
+from nrfgs_ns.training.twin import descend, picture, pull
+
+BESIDE = {"--pipeline.model.twin": "on", **REFINING}
+
+
+@pytest.fixture(autouse=True)
+def from_the_start(monkeypatch):
+    monkeypatch.setattr(twin, "START", 0)
+
+
+def ready(scene, out, *options):
+    trainer = set_up(command_line("nrfgs", scene, out, 10, BESIDE, *options))
+    trainer.twin.begin()
+    return trainer
+
+
+@pytest.mark.parametrize("method", ["nrfgs", "nrfgs-harmonics"])
+def test_a_training_with_a_twin_goes_on_from_its_checkpoint(method, tiny_scene, tmp_path, no_cuda):
+    whole = trained(command_line(method, tiny_scene, tmp_path / "whole", 14, BESIDE, {"--steps-per-save": 7}))
+    half = read_latest(models_of(whole), 7)[1]
+    more = {"--load-dir": models_of(whole), "--load-step": 7}
+    rest = trained(command_line(method, tiny_scene, tmp_path, 14, BESIDE, more))
+    both = [checkpoint_of(config) for config in (whole, rest)]
+    assert_same_training(*both)
+    twins = [{"step": 0, "pipeline": each["training"]["twin"]["model"], **each["training"]["twin"]} for each in both]
+    assert_same_training(*twins)
+    assert len(half["training"]["twin"]["model"]["gauss_params.means"]) != len(twins[0]["model"]["gauss_params.means"])
+    assert not both[0]["pipeline"]["_model.gauss_params.means"].equal(twins[0]["model"]["gauss_params.means"])
+
+
+def test_a_checkpoint_without_a_twin_goes_on_alone(tiny_scene, tmp_path, no_cuda):
+    alone = trained(command_line("nrfgs", tiny_scene, tmp_path / "alone", 4, BESIDE, {"--pipeline.model.twin": "off"}))
+    assert "twin" not in checkpoint_of(alone)["training"]
+    more = command_line("nrfgs", tiny_scene, tmp_path / "more", 6, BESIDE, {"--load-dir": models_of(alone)})
+    assert "twin" not in checkpoint_of(trained(more))["training"]
+
+
+@pytest.mark.parametrize("views, device, changed, every", [
+    (9, "cuda", {}, 2), (24, "cuda", {}, 3), (50, "cuda", {}, 5), (60, "cuda", {}, None), (9, "cpu", {}, None),
+    (9, "cuda", {"time_budget": 1.0}, None), (9, "cuda", {"schedule_steps": 3000}, None),
+    (9, "cuda", {"twin": "off"}, None), (10_000, "cpu", {"twin": "on"}, twin.RAREST),
+])  # fmt: skip
+def test_few_views_on_a_gpu_have_a_twin(views, device, changed, every, monkeypatch):
+    monkeypatch.setattr(twin, "START", 6000)
+    monkeypatch.setattr(twin, "Twin", lambda trainer, every: every)
+    still = SimpleNamespace(config=SimpleNamespace(mode="off"))
+    options = SimpleNamespace(twin=changed.pop("twin", "auto"))
+    model = SimpleNamespace(num_views=views, device=torch.device(device), camera_optimizer=still, config=options)
+    config = SimpleNamespace(**{"time_budget": None, "schedule_steps": 30_000, "max_num_iterations": 10_000, **changed})
+    assert twin.twin_of(SimpleNamespace(pipeline=SimpleNamespace(model=model), config=config)) == every
+
+
+def test_views_lie_between_neighbouring_cameras(tiny_scene, tmp_path, no_cuda, monkeypatch):
+    monkeypatch.setattr(twin, "JITTER", 0.0)
+    between = ready(tiny_scene, tmp_path).twin.between
+    for seed in range(20):
+        view = between.draw(Random(seed))
+        assert view.camera_to_worlds.equal(between.draw(Random(seed)).camera_to_worlds)
+        pose, index = view.camera_to_worlds[0], view.metadata["cam_idx"]
+        assert_close(pose[:, :3] @ pose[:, :3].T, torch.eye(3), rtol=0, atol=1e-5)
+        assert (view.fx, view.width) == (between.cameras.fx[index], between.cameras.width[index])
+        ends = between.cameras.camera_to_worlds[[index, *between.neighbours[index]], :, 3]
+        to_one, to_others = (pose[:, 3] - ends[0]).norm(), (pose[:, 3] - ends[1:]).norm(dim=1)
+        assert ((ends[1:] - ends[0]).norm(dim=1) - to_one - to_others).abs().min() < 1e-5  # on a line between two
+
+
+def test_a_pull_is_the_gradient_of_the_loss_against_the_others_picture(tiny_scene, tmp_path, no_cuda):
+    trainer = ready(tiny_scene, tmp_path)
+    model, other = trainer.pipeline.model, trainer.twin.pipeline.model
+    view = trainer.twin.between.draw(Random(0))
+    seen = picture(other, view)
+    assert seen.dtype == torch.uint8 and seen.shape[-1] == 4
+    model.view_noise.sigma, model.background_color = 0.0, torch.zeros(3)
+    model.config.background_color = "black"
+    gradients = pull(trainer, view, seen, 4)
+    assert model.gauss_params["latents"] not in gradients and model.gauss_params["means"] in gradients
+    truth = seen[..., :3] / 255 * (seen[..., 3:] / 255)
+
+    def loss(features):
+        model.gauss_params["features_dc"].data = features
+        rgb = model.get_outputs(view)["rgb"]
+        return photometric_loss(rgb, truth, model.config.ssim_lambda).item()
+
+    parameter = model.gauss_params["features_dc"]
+    start, gradient = parameter.data.clone(), gradients[parameter]
+    step = 1e-3 * gradient / gradient.norm()
+    slope = (loss(start + step) - loss(start - step)) / (2e-3)
+    assert slope == pytest.approx(gradient.norm().item(), rel=0.05)
+
+
+def test_densification_looks_at_photographs_alone(tiny_scene, tmp_path, no_cuda):
+    """A pull leaves the step's own gradients on the screen, and its image to the guard, as they are without it."""
+    trainer = ready(tiny_scene, tmp_path)
+    pipeline, model = trainer.pipeline, trainer.pipeline.model
+    start = {name: value.detach().clone() for name, value in model.named_parameters()}
+    seen = []
+    for pulls in (False, True):
+        pipeline.datamanager.train_unseen_cameras = [0]
+        view = trainer.twin.between.draw(Random(0))
+        more = pull(trainer, view, picture(trainer.twin.pipeline.model, view), 0) if pulls else {}
+        torch.manual_seed(1)
+        descend(trainer, 0, more)
+        seen.append(
+            (model.info["means2d"].grad.clone(), model.watched["the rendered image"], model.info["gaussian_ids"])
+        )
+        for name, value in model.named_parameters():
+            value.data.copy_(start[name])
+    assert_close(seen[1], seen[0])
+
+
+@pytest.mark.gpu
+def test_a_pull_is_the_same_recorded(tiny_scene, tmp_path):
+    exact = {"--pipeline.model.appearance.precision": "fp32", "--pipeline.model.twin": "auto"}
+    trainer = ready(tiny_scene, tmp_path, exact)
+    model = trainer.pipeline.model
+    results = []
+    for attempt in range(4):  # the first is eager, the second recorded, the third a replay
+        trainer.graphs._given_up = attempt == 3
+        model.step_cb(trainer.optimizers, 20)
+        view = trainer.twin.between.draw(Random(0))
+        seen = picture(trainer.twin.pipeline.model, view)
+        torch.manual_seed(7)
+        results.append(pull(trainer, view, seen, 20))
+    assert len(trainer.graphs._graphs) == 1
+    for name, parameter in model.named_parameters():
+        if parameter in results[3]:
+            expected = results[3][parameter]
+            for other in results[:3]:
+                assert (other[parameter] - expected).norm() <= 1e-4 * expected.norm() + 1e-9, name
