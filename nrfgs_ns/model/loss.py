@@ -24,22 +24,23 @@ def loss_of(
         batch: the datamanager's "image", and "mask" if there is one.
         is_between: the image is a twin's picture (`training/twin.py`), whose loss has only the photometric term, too.
     """
-    losses = {"main_loss": photometric(model, outputs, batch)}
+    losses = {"main_loss": photometric(model, outputs, batch, is_between)}
     if model.training and not is_between:
         model.camera_optimizer.get_loss_dict(losses)
         losses |= model.densification.regularisation(splats) | shrinkage(model, splats)
     return losses
 
 
-def photometric(model, outputs: Mapping[str, Any], batch: Mapping[str, Any]) -> Tensor:
-    """Splatfacto's loss of an image against its photograph, (1 - lambda) L1 + lambda (1 - SSIM), a scalar."""
+def photometric(model, outputs: Mapping[str, Any], batch: Mapping[str, Any], is_between: bool = False) -> Tensor:
+    """Splatfacto's loss of an image against its photograph, (1 - lambda) L1 + lambda (1 - SSIM), a scalar. Of
+    photographs alone pixels are trimmed, and residuals remembered."""
     rgb = outputs["rgb"]
     truth = model.truth_of(batch, outputs["background"])
     mask = None
     if "mask" in batch:  # pixels outside are black in both
         mask = model._downscale_if_required(batch["mask"]).to(model.device)
         truth, rgb = truth * mask, rgb * mask
-    if model.trimming is not None and model.training and model.trimming.is_on(model.schedule_step):
+    if model.trimming is not None and model.training and not is_between and model.trimming.is_on(model.schedule_step):
         kept = model.trimming(rgb, truth, model.schedule_step, mask)
         truth, rgb = truth * kept, rgb * kept
     return photometric_loss(rgb, truth, model.config.ssim_lambda)

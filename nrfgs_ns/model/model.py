@@ -162,7 +162,8 @@ class NrfgsModel(ExportedModel):
         """
         field = self.field
         look = self.look_of(self._photograph_of(camera))
-        outputs, self.info = self.render_view(self.project(camera, field.splats), self.noisy(field), look)
+        view, is_between = self.project(camera, field.splats), "between" in (camera.metadata or {})
+        outputs, self.info = self.render_view(view, self.noisy(field), look, is_between)
         return outputs
 
     @property
@@ -236,12 +237,14 @@ class NrfgsModel(ExportedModel):
         return field._replace(splats=self.view_noise.moved(field.splats, noise))
 
     def render_view(
-        self, view: View, noisy: Field, look: Callable[[Tensor], Tensor] | None
+        self, view: View, noisy: Field, look: Callable[[Tensor], Tensor] | None, is_between: bool = False
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """`composite_view` of a field as its head sees it (`noisy`), with a look (`look_of`): in evaluation, in the
-        eager and in the recorded step. In training, densification looks at it."""
+        eager and in the recorded step. In training, densification looks at it. `is_between`: over what a twin's picture
+        is over (`training/twin.py`)."""
         appearance = noisy.seen_from(view)
-        outputs, info = self.composite(view, appearance, look=look)
+        black = torch.zeros(3, device=self.device) if is_between and self.photograph is not None else None
+        outputs, info = self.composite(view, appearance, black, look)
         if self.training:
             shown = appearance.opacities
             stored = noisy.splats["opacities"]

@@ -280,7 +280,7 @@ class _StepGraph:
         with torch.enable_grad(), self.room.in_use():
             view = project_view(splats, self.pinhole, replace(model.projection_options, every_row=True))
             noisy = Field(head, model.view_noise.moved(splats, self.noise))
-            outputs, info = model.render_view(view, noisy, look)
+            outputs, info = model.render_view(view, noisy, look, self.is_between)
             losses = loss_of(model, splats, outputs, self.batch, self.is_between)
             sum(losses.values()).backward()
         self.gradients = {name: leaf.grad for name, leaf in leaves.items()}

@@ -81,6 +81,11 @@ class NrfgsTrainer(Trainer):
         """The signal that asks to stop; 0: none."""
         return self.request.signal or 0
 
+    @property
+    def _trainings(self) -> "list[NrfgsTrainer | Twin]":
+        """This training and its twin, if it has one."""
+        return [self] if self.twin is None else [self, self.twin]
+
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         end_earlier_logs()
         try:
@@ -183,8 +188,9 @@ class NrfgsTrainer(Trainer):
         """Train. Raises TrainingStopped where a number is not finite or memory has run out, and SystemExit with the
         status of a signal; the last good state has been written."""
         with self._last_good_state_on_disk():
-            self.guard.step = self._start_step
-            self.guard.check_parameters(self.optimizers)
+            for training in self._trainings:
+                training.guard.step = self._start_step
+                training.guard.check_parameters(training.optimizers)
         if isinstance(self.pace, TimedPace):  # the clock says which step is the last
             self.config = replace(self.config, max_num_iterations=sys.maxsize // 2)
         if self.line is not None:
@@ -321,12 +327,12 @@ class NrfgsTrainer(Trainer):
         kept = f"The last checkpoint is {last}." if last else "This training has written no checkpoint."
         if self._completed_step < self._start_step:
             return f"No step had been made. {kept}"
-        self.optimizers.zero_grad_all()
+        for training in self._trainings:
+            training.optimizers.zero_grad_all()
         gc.collect()
         torch.cuda.empty_cache()  # nothing without CUDA
-        model = self.pipeline.model
-        pairs = [(model, self.optimizers), *([(self.twin.pipeline.model, self.twin.optimizers)] if self.twin else [])]
-        if not all(rows_agree(m.gauss_params, o.optimizers, m.densification.state.values()) for m, o in pairs):
+        pairs = [(training.pipeline.model, training.optimizers.optimizers) for training in self._trainings]
+        if not all(rows_agree(model.gauss_params, each, model.densification.state.values()) for model, each in pairs):
             return f"Splats were being added or removed, so that nothing could be saved. {kept}"
         try:
             return f"Step {self._completed_step} is saved. {self._save_once()}."
@@ -354,8 +360,9 @@ class NrfgsTrainer(Trainer):
         """Write a checkpoint of finite numbers, or raise TrainingStopped, with the last good state on disk. Where the
         disk is full the training goes on with a warning, except at its end: DiskFull."""
         with self._last_good_state_on_disk():
-            self.guard.settle()
-            self.guard.check_parameters(self.optimizers)
+            for training in self._trainings:
+                training.guard.settle()
+                training.guard.check_parameters(training.optimizers)
         try:
             self._write_checkpoint(step)
         except DiskFull as full:

@@ -113,6 +113,8 @@ class NrfgsTrainerConfig(TrainerConfig):
             raise InputError("machine.device_type is cuda, but PyTorch finds no GPU (`nrfgs doctor`). Give cpu.")
         if devices > 1 and (self.time_budget or self.schedule_steps) is not None:
             raise InputError("time_budget and schedule_steps are for one device. Leave them out.")
+        if devices > 1 and self.pipeline.model.twin == "on":
+            raise InputError("pipeline.model.twin is for one device. Leave it out.")
         check_types(self.pipeline, "config.yml", "pipeline.")
         self.pipeline.model.check()
         if self.load_step is not None and self.load_dir is None:

@@ -92,12 +92,11 @@ class Twin:
         self.first, self.every, model = trainer, every, trainer.pipeline.model
         self.between = Between(trainer.pipeline.datamanager.train_dataset.cameras)
         given = {"scene_box": model.scene_box, "num_train_data": model.num_train_data, **model.kwargs}
-        with torch.random.fork_rng():
-            torch.manual_seed(model._seed + 1)
+        with torch.random.fork_rng(devices=[]):
+            torch.default_generator.manual_seed(model._seed + 1)
             second = model.config.setup(seed_points=model.seed_points, **given).to(model.device)
         second.learn_photographs(deepcopy(model.photograph))
         second.densification.verbose = False
-        model.densification.trainings = second.densification.trainings = 2
         if model.device.type == "cuda":
             second.head.try_kernels(model.device)
         self.pipeline = copy(trainer.pipeline)
@@ -109,6 +108,8 @@ class Twin:
 
     def begin(self) -> None:
         """Prepare for the first step, once a checkpoint has been loaded."""
+        for model in (self.first.pipeline.model, self.pipeline.model):
+            model.densification.trainings = 2
         self.callbacks = self.pipeline.model.get_training_callbacks(
             TrainingCallbackAttributes(self.optimizers, None, self.pipeline, None)
         )
@@ -196,8 +197,8 @@ def pull(training, view: Cameras, seen: Tensor, step: int) -> Gradients:
     else:
         optimizers.zero_grad_all()
         loss_of(model, model.gauss_params, model.get_outputs(view), batch, True)["main_loss"].backward()
-    names = PULLED if "field" in optimizers.optimizers else optimizers.optimizers
-    parameters = [p for name in names for p in parameters_of(optimizers.optimizers[name])]
+    pulled = [name for name in optimizers.optimizers if name in PULLED or "field" not in optimizers.optimizers]
+    parameters = [p for name in pulled for p in parameters_of(optimizers.optimizers[name])]
     # The next graph that runs writes where this one's gradients are.
     return {parameter: parameter.grad.clone() for parameter in parameters if parameter.grad is not None}
 

@@ -62,6 +62,12 @@ def test_scaled_gradients_are_refused(config, option):
         replace(config, **{option: True}).setup(local_rank=0, world_size=2)
 
 
+def test_a_twin_is_refused(config):
+    config = replace(config, pipeline=replace(config.pipeline, model=replace(config.pipeline.model, twin="on")))
+    with pytest.raises(InputError, match="twin is for one device"):
+        config.setup(local_rank=0, world_size=2)
+
+
 def workers(parent: int) -> list[int]:
     """Processes that multiprocessing has spawned, in the order of their ranks."""
     children = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()

@@ -12,6 +12,7 @@ from torch.testing import assert_close
 from nrfgs_ns.image.ssim import photometric_loss
 from nrfgs_ns.training import twin
 from nrfgs_ns.training.checkpoint_files import read_latest
+from nrfgs_ns.training.guard import TrainingStopped
 from nrfgs_ns.training.twin import descend, picture, pull
 
 BESIDE = {"--pipeline.model.twin": "on", **REFINING}
@@ -28,7 +29,7 @@ def ready(scene, out, *options):
     return trainer
 
 
-@pytest.mark.parametrize("method", ["nrfgs", "nrfgs-harmonics"])
+@pytest.mark.parametrize("method", ["nrfgs", "nrfgs-harmonics", "nrfgs-deferred"])
 def test_a_training_with_a_twin_goes_on_from_its_checkpoint(method, tiny_scene, tmp_path, no_cuda):
     whole = trained(command_line(method, tiny_scene, tmp_path / "whole", 14, BESIDE, {"--steps-per-save": 7}))
     half = read_latest(models_of(whole), 7)[1]
@@ -45,8 +46,17 @@ def test_a_training_with_a_twin_goes_on_from_its_checkpoint(method, tiny_scene, 
 def test_a_checkpoint_without_a_twin_goes_on_alone(tiny_scene, tmp_path, no_cuda):
     alone = trained(command_line("nrfgs", tiny_scene, tmp_path / "alone", 4, BESIDE, {"--pipeline.model.twin": "off"}))
     assert "twin" not in checkpoint_of(alone)["training"]
-    more = command_line("nrfgs", tiny_scene, tmp_path / "more", 6, BESIDE, {"--load-dir": models_of(alone)})
-    assert "twin" not in checkpoint_of(trained(more))["training"]
+    trainer = set_up(command_line("nrfgs", tiny_scene, tmp_path / "more", 6, BESIDE, {"--load-dir": models_of(alone)}))
+    trainer.train()
+    assert trainer.twin is None and trainer.pipeline.model.densification.trainings == 1
+
+
+def test_a_checkpoint_is_of_a_twin_of_finite_numbers(tiny_scene, tmp_path, no_cuda):
+    trainer = ready(tiny_scene, tmp_path)
+    trainer.twin.pipeline.model.gauss_params["means"].data[3] = torch.nan
+    with pytest.raises(TrainingStopped, match="means has NaN"):
+        trainer.save_checkpoint(4)
+    assert read_latest(trainer.checkpoint_dir)[1]["training"]["twin"]["model"]["gauss_params.means"].isfinite().all()
 
 
 @pytest.mark.parametrize("views, device, changed, every", [
@@ -78,6 +88,13 @@ def test_views_lie_between_neighbouring_cameras(tiny_scene, tmp_path, no_cuda, m
         assert ((ends[1:] - ends[0]).norm(dim=1) - to_one - to_others).abs().min() < 1e-5  # on a line between two
 
 
+def test_with_exposures_pictures_and_what_learns_from_them_are_over_black(tiny_scene, tmp_path, no_cuda):
+    trainer = ready(tiny_scene, tmp_path, {"--pipeline.model.photographs": "on"})
+    model, view = trainer.pipeline.model, trainer.twin.between.draw(Random(0))
+    model.view_noise.sigma = 0.0
+    assert_close(picture(model, view) / 255, model.get_outputs(view)["rgb"], rtol=0, atol=0.5001 / 255)
+
+
 def test_a_pull_is_the_gradient_of_the_loss_against_the_others_picture(tiny_scene, tmp_path, no_cuda):
     trainer = ready(tiny_scene, tmp_path)
     model, other = trainer.pipeline.model, trainer.twin.pipeline.model
@@ -103,9 +120,10 @@ def test_a_pull_is_the_gradient_of_the_loss_against_the_others_picture(tiny_scen
 
 
 def test_densification_looks_at_photographs_alone(tiny_scene, tmp_path, no_cuda):
-    """A pull leaves the step's own gradients on the screen, and its image to the guard, as they are without it."""
-    trainer = ready(tiny_scene, tmp_path)
+    """A pull leaves the step's gradients on the screen, its image to the guard and its residuals as without it."""
+    trainer = ready(tiny_scene, tmp_path, {"--pipeline.model.robust-loss": 0.1})
     pipeline, model = trainer.pipeline, trainer.pipeline.model
+    model.schedule_at(500)  # where pixels are trimmed
     start = {name: value.detach().clone() for name, value in model.named_parameters()}
     seen = []
     for pulls in (False, True):
@@ -114,9 +132,9 @@ def test_densification_looks_at_photographs_alone(tiny_scene, tmp_path, no_cuda)
         more = pull(trainer, view, picture(trainer.twin.pipeline.model, view), 0) if pulls else {}
         torch.manual_seed(1)
         descend(trainer, 0, more)
-        seen.append(
-            (model.info["means2d"].grad.clone(), model.watched["the rendered image"], model.info["gaussian_ids"])
-        )
+        info, remembered = model.info, model.trimming.histogram.clone()
+        seen.append((info["means2d"].grad, model.watched["the rendered image"], info["gaussian_ids"], remembered))
+        model.trimming.histogram.zero_()
         for name, value in model.named_parameters():
             value.data.copy_(start[name])
     assert_close(seen[1], seen[0])
