@@ -58,8 +58,7 @@ class ErrorGuided(DensificationConfig):
     counts: ClassVar[tuple[str, ...]] = ("budget", "most_splats")
     copies_splats: ClassVar[bool] = True
     opacity_seen: OpacitySeen = "peak"
-    """opacity by which splats are pruned, moved or replaced (docs/deviations.md). base: stored. peak: largest shown
-    lately"""
+    """opacity by which splats are pruned or replaced (docs/deviations.md). base: stored. peak: largest shown lately"""
     refine_every: int = 200
     """steps between refinements"""
     threshold: float = 0.0025
