@@ -114,8 +114,7 @@ def watched() -> str:
 
 
 def scale() -> str:
-    """Steps after growth: milliseconds, those of the GPU's work, and gigabytes at the peak; then frames per second at
-    1080p and 4K. Medians of repeats."""
+    """Steps after growth: milliseconds, the GPU's, gigabytes at the peak; then frames per second. All are medians."""
 
     def rows(label: str, columns: dict[str, tuple[float, str]]) -> Iterator[list[str]]:
         cells = {column: scale_cells(column) for column in columns}
