@@ -50,8 +50,7 @@ class NrfgsTrainerConfig(TrainerConfig):
     """steps for which schedules are given; they are stretched to the actual steps. None: max_num_iterations with a time
     budget, otherwise not stretched"""
     average_steps: int | None = None
-    """last steps over which parameters are averaged, at most a fiftieth of all. None: 200 if max_num_iterations is 0,
-    otherwise 0"""
+    """last steps to average parameters over, at most a fiftieth of all. None: 200 if max_num_iterations is 0, else 0"""
 
     def __post_init__(self) -> None:
         file = self.load_config  # all that ns-train takes, if it is given
