@@ -12,8 +12,7 @@ from nrfgs_ns.errors import InputError
 
 
 def check_writable(path: Path, option: str) -> None:
-    """Raise InputError where a file cannot be written: before a command's work, which makes its folders, not after it.
-    `option` named the file."""
+    """Raise InputError, before a command's work, where a file cannot be written. `option` named the file."""
     try:
         if path.exists() and not path.is_file():  # a device would be replaced
             raise InputError(f"{option} {path} is a folder or a device. Name a file.")

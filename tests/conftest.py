@@ -16,8 +16,7 @@ settings.load_profile("nrfgs")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# Modules that several test files share. tests/ itself would let its folders pass for packages of their names, and
-# nerfbaselines for installed.
+# Modules that several test files share. tests/ itself would let its folders pass for packages, such as nerfbaselines.
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE / d) for d in ("helpers", "fixtures", "appearance", "densification", "image", "rasterizer")]
 

@@ -83,10 +83,9 @@ def imported(package: str) -> set[str]:
     return names - set(sys.stdlib_module_names) - set(PACKAGES) - HOSTS
 
 
-@pytest.mark.parametrize(
-    ("package", "extras"),
-    [("nrfgs_ns", ["kernels", "heic"]), ("nrfgs_prepare", []), ("nrfgs_lab", ["lab", "flip", "browser"])],
-)
+@pytest.mark.parametrize(("package", "extras"), [
+    ("nrfgs_ns", ["kernels", "heic"]), ("nrfgs_prepare", []), ("nrfgs_lab", ["lab", "flip", "browser"]),
+])  # fmt: skip
 def test_what_is_imported_is_declared(about, package, extras):
     known, requirements = packages_distributions(), declared(about, "", *extras)
     for name in imported(package):

@@ -81,8 +81,7 @@ def mirrors_already(mirror: Path, folder: Path) -> bool:
 
 
 def held_out_views(names: list[str], first: int, every: int = TEST_EVERY) -> list[str]:
-    """Views to hold out: by default every 8th, or every 6th of fewer than 30 views if every 8th gives fewer than
-    three."""
+    """Views to hold out: by default every 8th, or every 6th of fewer than 30 if every 8th gives fewer than three."""
     chosen = names[first::every]
     return names[first::6] if every == TEST_EVERY and len(names) < 30 and len(chosen) < 3 else chosen
 

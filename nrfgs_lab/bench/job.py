@@ -45,8 +45,7 @@ def command(spec: Spec, cell: Cell, parser: list[str], work: Path) -> list[str]:
 
 
 def identity(spec: Spec, cell: Cell, parser: list[str] | None) -> dict[str, Any]:
-    """What decides a run's result, without paths, which differ between machines; without a `parser`, as for `command`,
-    how the data are read is not compared."""
+    """What decides a run's result, without paths; without a `parser` how the data are read is not compared."""
     drop = ("--output-dir", "--steps-per-save")
     args = command(spec, cell, [], Path())
     kept = [word for before, word in zip(["", *args], args, strict=False) if word not in drop and before not in drop]

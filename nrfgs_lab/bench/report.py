@@ -17,9 +17,8 @@ FAILURE = ".failed"
 
 
 def report(spec: Spec, cells: list[Cell], out: Path, work: Path, stale: dict[str, str]) -> None:
-    """Print the table; write table.md, summary.json, crops/, with knobs tradeoff.{md,png} into OUT, whose runs/ holds
-    the records. `stale` ones, name -> difference, are left out. Without the trainings' pictures in `work` there are no
-    crops."""
+    """Print the table; write table.md, summary.json, crops/ (of pictures in `work`), with knobs tradeoff.{md,png} into
+    OUT, whose runs/ holds the records. `stale` ones, name -> difference, are left out."""
     rows = rows_from_records(cells, out / "runs", stale)
     for name, difference in stale.items():
         print(f"{name} is stale: it was made with {difference}")

@@ -72,8 +72,7 @@ def noise_bound(deviation: float | None, freedom: int, n: int, m: int) -> float:
 
 
 def changes(rows: Sequence[Row], default: Row, column: Column, ratio: bool) -> dict[str, Change]:
-    """Change of a column against the default by run, for rows of one scene with values in it; of positive values, as a
-    ratio."""
+    """Change of a column against the default by run, of a scene's rows with values in it; `ratio`: of positive ones."""
     samples = {row.run: list(row.values[column.name].values()) for row in rows}
     if ratio:
         samples = {run: [math.log(value) for value in values if value > 0] for run, values in samples.items()}
@@ -123,8 +122,7 @@ def front_of(rows: Sequence[Row], cost: str) -> list[str]:
 
 
 def report(rows: list[Row], knobs: dict[str, str], out: Path) -> None:
-    """Write OUT/tradeoff.{md,png} and print the table: rows with their averages over scenes, and the knob of each
-    run."""
+    """Write OUT/tradeoff.{md,png} and print the table: rows with averages over scenes, and the knob of each run."""
     texts = []
     for scene in dict.fromkeys(row.scene for row in rows):
         of_scene = [row for row in rows if row.scene == scene]

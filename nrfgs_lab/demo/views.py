@@ -69,8 +69,7 @@ class Look:
         return views
 
     def highlight(self, view: int, shine: Tensor) -> Highlight:
-        """The place of test view `view` where gloss does most, from an arc of views about the vertical through it;
-        `shine` is of that view, [H, W]."""
+        """The place of a test view where gloss does most (`shine`, [H, W]), from an arc of views about its vertical."""
         window = brightest_window(shine)
         middle = np.array([[window[1] + 0.5 * window[3], window[0] + 0.5 * window[2]]])
         points, _ = self.glossy.first_hit(*camera_rays(self.scene, self.poses[view], middle))
@@ -89,8 +88,7 @@ class Look:
 
 
 def turned(pose: np.ndarray, point: np.ndarray, angle: float) -> np.ndarray:
-    """A camera-to-world matrix [4, 4] turned by `angle` radians about the vertical through a point [3]: the camera sees
-    the point at the same pixel."""
+    """A pose [4, 4] turned by `angle` radians about the vertical through a point [3], seen at the same pixel."""
     turn = np.eye(4)
     turn[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
     turn[:3, 3] = point - turn[:3, :3] @ point

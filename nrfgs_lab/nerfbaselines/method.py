@@ -285,8 +285,7 @@ def _opengl(poses: np.ndarray) -> Tensor:
 
 
 def hold_in_memory(config: NrfgsDatamanagerConfig, dataset: dict[str, Any], world: World) -> None:
-    """Let a datamanager's configuration hold nerfbaselines' training set in memory: its classes are replaced, because
-    nerfstudio copies configurations."""
+    """Let a datamanager hold nerfbaselines' training set, by its classes, since nerfstudio copies configurations."""
     cameras, images, masks = world.cameras(dataset["cameras"]), dataset["images"], dataset.get("masks")
     metadata: dict[str, Tensor] = {}
     if (xyz := dataset.get("points3D_xyz")) is not None:

@@ -13,8 +13,7 @@ from nrfgs_lab.pages.runs import VIEWS, Trainings, bench_rows, grid, mean, recor
 FIELD, HOST, SAME = "nrfgs", "splatfacto", "harmonics, same rules"
 FEW = list(VIEWS)[1:]
 SPARSE = {"24_views_bonsai": (24, "22.60"), "kitchen": (21, "19.24 (other views)")}
-"""Scene of results/twenty-four.json -> training views, and 3DGS's PSNR with 24 at one eighth of the size, from other
-implementations (arXiv 2508.04968)."""
+"""Scene of results/twenty-four.json -> training views, and others' PSNR of 3DGS at an eighth (arXiv 2508.04968)."""
 HALF = {f"{views}_views_bonsai": views for views in (16, 24, 32, 64, 128)} | {"bonsai": 255}
 """Half-size scenes there -> training views."""
 MADE = {"glossy": "made", "matt": "made_matt"}
@@ -74,8 +73,7 @@ def verdict(gains: list[float]) -> str:
 
 
 def captures() -> str:
-    """The field and splatfacto with default settings on test views, and what the field gains over harmonics with its
-    rules."""
+    """The field and splatfacto by default on test views, and what the field gains over harmonics with its rules."""
     body = []
     for scene, views in VIEWS.items():
         field = today(scene, FIELD)
@@ -85,8 +83,7 @@ def captures() -> str:
 
 
 def over_host_where_seen() -> str:
-    """Gain of the field over splatfacto, both with default settings, on captures with 7 test views or more, least and
-    most: in the mean, and in the median view."""
+    """Gain over splatfacto on captures with 7 test views or more, least and most: in the mean and the median view."""
     pairs = [(today(scene, FIELD), host(scene)) for scene in VIEWS]
     pairs = [pair for pair in pairs if len(pair[0][0]["per_image"]) >= 7]
     means = [mean(field, "psnr") - mean(other, "psnr") for field, other in pairs]

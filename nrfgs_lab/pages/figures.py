@@ -13,7 +13,7 @@ from statistics import median
 from nrfgs_lab.pages.few_views import FIELD, HALF, MADE, SAME, sparse_runs, today
 from nrfgs_lab.pages.files import CAPTURES, reports
 from nrfgs_lab.pages.methods import COUNTS, CURVES, HEADS_OF, RULES_OF, SEATS_OF, Labels, equal
-from nrfgs_lab.pages.runs import ROOT, VIEWS, bench_rows, mean_of, records, view_gains
+from nrfgs_lab.pages.runs import ROOT, VIEWS, bench_rows, mean_of, records, signed, view_gains
 from nrfgs_ns.files import write_whole
 
 WIDTH, LEFT, ROW = 640, 130, 34
@@ -48,10 +48,8 @@ def views() -> str:
         parts += [f'<circle class="{kind}" cx="{x(v)}" cy="{y}" r="5" fill-opacity="0.55"/>' for v, kind in kinds]
         parts.append(f'<line class="rule" stroke-width="3" x1="{middle}" x2="{middle}" y1="{y - 12}" y2="{y + 12}"/>')
     parts.append(f'<line class="rule" x1="{x(0)}" x2="{x(0)}" y1="8" y2="{height - 42}"/>')
-    ticks = [gain for gain in range(least, most + 1) if gain % 2 == 0]
-    parts += [
-        f'<text x="{x(g)}" y="{height - 25}" text-anchor="middle">{g:+d}</text>'.replace("+0", "0") for g in ticks
-    ]
+    ticks = {gain: signed(gain, 0) for gain in range(least, most + 1) if gain % 2 == 0}
+    parts += [f'<text x="{x(g)}" y="{height - 25}" text-anchor="middle">{text}</text>' for g, text in ticks.items()]
     parts.append(f'<text x="{(LEFT + WIDTH) / 2}" y="{height - 5}" text-anchor="middle">field - harmonics, dB</text>')
     return svg(height, parts)
 
@@ -71,8 +69,7 @@ FITTED = {
 
 
 def axes(box: tuple[float, float, float], ticks: dict[float, str], values: list[float], title: str) -> tuple:
-    """A logarithmic axis with ticks and one that holds values, between left, top and right: `at`, which places a point,
-    and the parts."""
+    """A logarithmic axis with ticks and one that holds values, in a box: `at`, which places a point, and the parts."""
     step = next(step for step in (0.01, 0.02, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0) if max(values) - min(values) < 7 * step)
     low, high = math.floor(min(values) / step + 1e-6) * step, math.ceil(max(values) / step - 1e-6) * step
     (left, top, right), least, most = box, min(ticks) / 1.3, max(ticks) * 1.1

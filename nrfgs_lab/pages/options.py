@@ -17,7 +17,6 @@ from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from nrfgs_ns import method_config
-from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.densification import STRATEGIES, DensificationConfig
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "options.md"
@@ -37,11 +36,9 @@ SPLATFACTOS = {field.name for field in dataclasses.fields(SplatfactoModelConfig)
 LEFT_OUT = (
     *("logging.local-writer.enable", "pipeline.datamanager.cache-images-type", "pipeline.sharding.rebalance-at"),
     *(APPEARANCE + name for name in ("distance-eps", "implementation", "precision", "output-init", "opacity-bound")),
-    *("load-3D-points", "eval-mode", "viewer.websocket-host", "pipeline.datamanager.image-memory", "pipeline.compact"),
-    MODEL + "warmup-steps",
+    *("viewer.websocket-host", "pipeline.datamanager.image-memory", "pipeline.compact", MODEL + "warmup-steps"),
 )
 """Options that few need, or that another page explains: `--help` has them."""
-HOST = "`ns-train --help` explains the other methods, `nrfgs --help` the other commands.\n"
 
 
 class Option(NamedTuple):
@@ -104,9 +101,7 @@ def page() -> str:
     options = [option for option in own_options(methods()[0].config) if option.flag not in LEFT_OUT]
     heads = [option for option in options if option.flag.startswith(APPEARANCE)]
     model = [option for option in options if option.flag.startswith(MODEL) and option not in heads]
-    rest = [option._replace(flag=f"--{option.flag}") for option in options if not option.flag.startswith(MODEL)]
-    data = [option for option in own_options(NrfgsDataParserConfig()) if option.flag not in LEFT_OUT]
-    data = [option._replace(flag=f"nrfgs-data --{option.flag}") for option in data]
+    rest = [option for option in options if not option.flag.startswith(MODEL) and ".dataparser." not in option.flag]
     parts = [
         INTRODUCTION,
         "## The field\n",
@@ -114,9 +109,8 @@ def page() -> str:
         "## The model, with every head\n",
         listed(model, MODEL),
         strategies(),
-        "## Training and data\n\n`nrfgs-data` and what follows it come last in a command.\n",
-        listed([option for option in rest if ".dataparser." not in option.flag] + data),
-        HOST,
+        "## Training\n",
+        listed([option._replace(flag=f"--{option.flag}") for option in rest]),
     ]
     return "\n".join(parts)
 

@@ -171,8 +171,7 @@ def swing(tab, file: Path) -> None:
 
 
 def beside(theirs: Path, ours: Path) -> None:
-    """Write views.jpg: the test views of the median and of the largest gain over another training, from pictures of
-    photograph and rendering side by side."""
+    """Write views.jpg: the test views of the median and the largest gain over a training, from pictures of both."""
     rows = []
     for files in zip(*(sorted(folder.glob("*.png")) for folder in (theirs, ours)), strict=True):
         (truth, first), (_, second) = (np.split(np.asarray(Image.open(file)) / 255, 2, axis=1) for file in files)

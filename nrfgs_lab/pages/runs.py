@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The vocabulary of the blocks: records, the trainings in them, what they gain over each other, and how it is written.
 
-A training is a dictionary with `seed`, `psnr`, `ssim`, `ms_ssim` and `flip` (means over test views), `train_psnr`,
-`splats` and `per_image`: for each test view its name, PSNR, SSIM and MS-SSIM.
+A training is a dictionary with `seed`, `psnr`, `ssim`, `ms_ssim` and `flip` (means over test views), `splats` and
+`per_image`: for each test view its name, PSNR and SSIM.
 """
 
 import json
@@ -57,11 +57,11 @@ def mean_of(row: Row, column: str) -> float:
 def trainings(study: str, scene: str, run: str, strategy: str = ORIGINAL) -> Trainings:
     """The trainings of a run of a benchmark; none of a missing one."""
     row = bench_rows(study).get((scene, strategy, run))
-    metrics, trainings = ("psnr", "ssim", "ms_ssim"), []
+    trainings = []
     for seed, record in row.records.items() if row else ():
-        test, train = record["measured"]["test"], record["measured"]["train"] or {}
-        views = [[view["image"], *(view[metric] for metric in metrics)] for view in test["per_image"]]
-        values = {metric: test.get(metric) for metric in (*metrics, "flip")} | {"train_psnr": train.get("psnr")}
+        test = record["measured"]["test"]
+        views = [[view["image"], view["psnr"], view["ssim"]] for view in test["per_image"]]
+        values = {metric: test.get(metric) for metric in ("psnr", "ssim", "ms_ssim", "flip")}
         trainings.append({**values, "seed": seed, "per_image": views, "splats": record["measured"]["splats"]})
     return trainings
 

@@ -73,8 +73,7 @@ PROFILED = 10
 
 
 class Stopwatch:
-    """Milliseconds of a step on the clock and of the GPU's work in it, and peak memory since the first step, of a
-    training with `steps` on the clock."""
+    """Milliseconds of a step and of the GPU's work in it, and peak memory, of a training with `steps` on the clock."""
 
     step_ms = gpu_ms = peak_bytes = 0
 

@@ -1,3 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A trained field in a small file. The docstrings of `format.py`, `encode.py`, `tables.py` and `entropy.py` are the
-specification."""
+"""A trained field in a small file, which `format.py`, `encode.py`, `tables.py` and `entropy.py` specify."""

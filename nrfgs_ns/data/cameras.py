@@ -236,8 +236,7 @@ def _check_model(meta: dict[str, Any], source: Path) -> None:
 
 
 def cameras_of(meta: dict[str, Any], lenses: np.ndarray, poses: Tensor, source: Path) -> Cameras:
-    """The cameras in full size, with intrinsics by `read_lenses` and poses [V, 3, 4]; InputError if undistorting would
-    leave next to nothing of an image."""
+    """The cameras in full size, of `read_lenses` and poses [V, 3, 4]; InputError if undistorting leaves too little."""
     kind = CAMERA_MODEL_TO_TYPE[meta.get("camera_model", "OPENCV")]
     table = torch.from_numpy(lenses)
     fx, fy, cx, cy = table[:, :4].float().unbind(1)

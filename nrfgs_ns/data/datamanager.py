@@ -90,8 +90,7 @@ class NrfgsInputDataset(InputDataset):
         return picture if picture.size == tuple(size) else picture.resize(size, sampling)
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
-        """The undistorted "image" [H, W, 3 or 4], "image_idx", and with masks "mask" bool [H, W, 1]; InputError if a
-        file cannot be used."""
+        """The undistorted "image" [H, W, 3 or 4], "image_idx", and with masks "mask" bool [H, W, 1]; or InputError."""
         image = self.get_image_float32(image_idx) if image_type == "float32" else self.get_image_uint8(image_idx)
         data = {"image_idx": image_idx, "image": image}
         if (masks := self._dataparser_outputs.mask_filenames) is not None:
@@ -118,8 +117,7 @@ class NrfgsDatamanagerConfig(FullImageDatamanagerConfig):
     cache_images_type: Literal["uint8", "float32"] = "uint8"
     """The image type returned from manager, caching images in uint8 saves memory"""
     image_memory: float | None = None
-    """gigabytes of host memory for decoded images; more images are kept in files (docs/own-data.md). None: half of what
-    is free"""
+    """gigabytes of host memory for decoded images; more go to files (docs/own-data.md). None: half of what is free"""
 
 
 class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
@@ -154,8 +152,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         return "training" if evaluated <= trained else "test"
 
     def load_all_images(self) -> None:
-        """Decode all images. InputError if an image or a mask cannot be used, or nothing is visible in any training
-        image."""
+        """Decode all images. InputError if one cannot be used, or nothing is visible in any training image."""
         for dataset, images in ((self.train_dataset, self.cached_train), (self.eval_dataset, self.cached_eval)):
             pairs = zip(dataset.image_filenames, images, strict=True)
             if empty := [path.name for path, data in pairs if not _shows_anything(data)]:
@@ -169,13 +166,11 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         return self.train_view(self._next_index())
 
     def train_view(self, index: int) -> tuple[Cameras, dict[str, Any]]:
-        """A training camera, [1] on the device with "cam_idx" in its metadata, and its "image" [H, W, 3 or 4],
-        "image_idx" and "mask"."""
+        """A training camera, [1] on the device with "cam_idx" in its metadata, and its photograph by `get_data`."""
         return self._view(index), self._image(index)
 
     def next_train_views(self, count: int, own: int) -> tuple[list[Cameras], dict[str, Any]]:
-        """The next `count` training cameras in turn, [1] each, and the photograph of the one at position `own` of
-        them."""
+        """The next `count` training cameras in turn, [1] each, and the photograph of the one at position `own`."""
         indices = [self._next_index() for _ in range(count)]
         return [self._view(index) for index in indices], self._image(indices[own])
 
@@ -200,8 +195,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
 
     @cached_property
     def _storage(self) -> Literal["device", "memory", "files"]:
-        """Where decoded images are kept: on the device if they take at most half of its free memory, else on the host,
-        else in files."""
+        """Where decoded images are: on the device if half of its free memory is enough, on the host, or in files."""
         each = 1 if self.config.cache_images_type == "uint8" else 4
         size = 0
         for dataset in (self.train_dataset, self.eval_dataset):

@@ -211,8 +211,7 @@ class NrfgsDataParser(DataParser):
 
     @cached_property
     def _placed_points(self) -> dict[str, torch.Tensor]:
-        """points3D_xyz float32 [N, 3] and points3D_rgb uint8 [N, 3] in the cameras' world; nothing, with a warning, if
-        there are too few."""
+        """points3D_xyz float32 [N, 3] and points3D_rgb uint8 [N, 3] in the cameras' world; if too few, a warning."""
         data_set = self._data_set
         points = self._points(data_set)
         count = 0 if points is None else len(points[0])
@@ -270,8 +269,7 @@ class NrfgsDataParser(DataParser):
         return {split: (name, meta[name]) for split, name in fields.items() if name in meta}
 
     def _points(self, data_set: DataSet) -> tuple[np.ndarray, np.ndarray, torch.Tensor] | None:
-        """Positions [N, 3] and colours [N, 3] as stored, and the transform [3, 4] from their world to the cameras'
-        before scaling; None without."""
+        """Positions and colours [N, 3] as stored, and the transform [3, 4] to the cameras' unscaled world; or None."""
         if "ply_file_path" in data_set.meta:
             return *read_ply(self._file(str(data_set.meta["ply_file_path"]))), data_set.transform
         if self._colmap.is_dir():

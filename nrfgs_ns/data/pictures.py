@@ -68,8 +68,7 @@ def naming(path: Path, finding: str) -> Iterator[None]:
 
 
 def picture_names(paths: Sequence[Path]) -> list[str]:
-    """Names of pictures that tell them apart: the files', or where two are alike, as of several cameras with a folder
-    each, the paths below their common folder."""
+    """Names that tell pictures apart: the files', or where two are alike the paths below their common folder."""
     names = [path.name for path in paths]
     if len(set(names)) < len(names):
         names = [path.relative_to(os.path.commonpath(paths)).as_posix() for path in paths]
@@ -122,8 +121,7 @@ def in_parallel(
 ) -> Iterator[Result]:
     """Results of `read(0)`, `read(1)`, ..., which decode pictures of these sizes (width, height), on `workers` threads
     (default: one for each processor, fewer for small pictures), as far as half of the free memory allows. The first
-    failure ends the reading; so does, with InputError, a lack of memory for the largest picture. `what` labels the
-    progress bar."""
+    failure ends the reading, as does a lack of memory for the largest (InputError). `what` labels the progress bar."""
     from nerfstudio.utils.rich_utils import CONSOLE  # slow to import, and not needed by `nrfgs prepare`
 
     width, height = max(sizes, key=math.prod, default=(1, 1))

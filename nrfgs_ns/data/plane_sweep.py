@@ -215,8 +215,7 @@ def dense_points(
 
 
 def _agreed(views: Views, inverse: Tensor, good: Tensor, one: int, others: Tensor) -> tuple[Tensor, Tensor]:
-    """Points of a view that `AGREEING` others have at the same depth. Takes their pixels out of `good`, so that each
-    point comes once."""
+    """Points of a view at the same depth in `AGREEING` others; their pixels leave `good`, so that each comes once."""
     chosen = good[one]
     world = torch.linalg.inv(views.world_to_camera[one])
     xyz = _rays(views, one)[chosen] / inverse[one][chosen][:, None] @ world[:3, :3].T + world[:3, 3]
@@ -230,8 +229,7 @@ def _agreed(views: Views, inverse: Tensor, good: Tensor, one: int, others: Tenso
         x, y = x.clamp(0, width - 1), y.clamp(0, height - 1)
         same.append(inside & good[other, y, x] & ((inverse[other, y, x] * seen[:, 2] - 1).abs() < WITHIN))
         pixels.append((other, y, x))
-    kept = torch.stack(same).sum(dim=0) >= AGREEING if same else torch.zeros(len(xyz), dtype=torch.bool)
-    kept = kept.to(xyz.device)
+    kept = torch.stack(same).sum(dim=0) >= AGREEING if same else torch.zeros_like(xyz[:, 0], dtype=torch.bool)
     for (other, y, x), agrees in zip(pixels, same, strict=True):
         good[other, y[agrees & kept], x[agrees & kept]] = False
     return xyz[kept], views.rgb[one][chosen][kept]
@@ -253,8 +251,7 @@ def _transfer(views: Views, one: int, others: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _mean_of_largest(rows: Tensor, count: int) -> Tensor:
-    """Mean of the `count` largest along the first dimension, which is short: by exchanges of whole rows, on a CPU
-    quicker than `topk`."""
+    """Mean of the `count` largest along the first, short dimension: exchanges of rows, on a CPU quicker than `topk`."""
     sorted_rows = list(rows)
     for first in range(count):
         for at in range(len(sorted_rows) - 1, first, -1):
@@ -264,8 +261,7 @@ def _mean_of_largest(rows: Tensor, count: int) -> Tensor:
 
 
 def _window_mean(images: Tensor) -> Tensor:
-    """Means over windows [N, C, H, W], which end at the image's edges: by sums of shifted images, on a CPU quicker than
-    `avg_pool2d`."""
+    """Means over windows [N, C, H, W] that end at image edges: shifted sums, on a CPU quicker than `avg_pool2d`."""
     half = WINDOW // 2
     for padding, dim in (((half, half), -1), ((0, 0, half, half), -2)):
         size = images.shape[dim]

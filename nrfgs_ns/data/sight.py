@@ -23,8 +23,7 @@ FEWEST_SEEN = 0.01
 MOST_BLIND = 0.5
 """Share of the views that may see no point."""
 LEAST_SPREAD = 0.01
-"""Smallest median distance of points from their middle, relative to the cameras' from there; in real captures it is at
-least 0.1."""
+"""Smallest median distance of points from their middle, relative to the cameras'; in real captures at least 0.1."""
 ONE_WORLD = "Poses, intrinsics and points must be of one reconstruction, in one world and unit."
 
 

@@ -45,8 +45,7 @@ def split_by_names(named: Named, images: list[Path], path_of: Callable[[str], Pa
 
 
 def split_by_rule(config: Any, images: list[Path], source: Path) -> Rows:
-    """Rows of the parts by the parser's `eval_mode`; InputError if it cannot split these images. A single image is for
-    training."""
+    """Rows of the parts by the parser's `eval_mode`; InputError if it cannot split. A single image is for training."""
     count = len(images)
     mode, every = config.eval_mode, config.eval_interval
     if count == 1:

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Choices of views: evenly spaced, for testing, different from each other; a capture's unit of length, and how near it
-comes."""
+"""Choices of views: evenly spaced, for testing, different ones; a capture's unit of length, and how near it comes."""
 
 from __future__ import annotations
 

@@ -58,19 +58,18 @@ class ErrorGuided(DensificationConfig):
     counts: ClassVar[tuple[str, ...]] = ("budget", "most_splats")
     copies_splats: ClassVar[bool] = True
     opacity_seen: OpacitySeen = "peak"
-    """opacity by which splats are pruned, moved or replaced (docs/deviations.md). base: stored. peak: largest shown
-    lately"""
+    """opacity by which splats are pruned or replaced (docs/deviations.md). base: stored. peak: largest shown lately"""
     refine_every: int = 200
     """steps between refinements"""
     threshold: float = 0.0025
-    """error above which a splat may be split: the smaller, the more splats and detail. V training views multiply it by
-    1 + (V / 300)^2"""
+    """error above which a splat may be split: less gives more detail. V training views multiply it by 1 + (V /
+    300)^2"""
     budget: int = 0
     """number of splats to grow to (arXiv 2605.16158). 0: the threshold decides"""
     most_splats: int = 2_000_000
     """upper bound; growth usually ends below it"""
     shrinkage: float = 0.2
-    """constant weight that is added to the model's, in percent, because no reset removes large faint splats"""
+    """constant weight added to the model's, in percent, since no reset removes large faint splats"""
     grow_until: int = 15_000
     """step after which splats are only replaced"""
     stop_at: int = 25_000

@@ -60,8 +60,7 @@ class Splatfacto(GradientConfig):
 
     name: ClassVar[str] = "splatfacto"
     densify_grad_thresh: float = 0.0008
-    """mean gradient of the loss by the screen position (in [-1, 1]) above which splats grow; its absolute values are
-    summed over pixels (AbsGS)"""
+    """mean gradient by the screen position (in [-1, 1]) above which splats grow; absolute values are summed (AbsGS)"""
     cull_alpha_thresh: float = 0.1
     """opacity below which splats are pruned; a reset lowers opacities to twice this"""
 

@@ -49,8 +49,7 @@ class Mcmc(DensificationConfig):
     copies_splats: ClassVar[bool] = True
     regularises: ClassVar[bool] = True
     opacity_seen: OpacitySeen = "peak"
-    """opacity by which splats are pruned, moved or replaced (docs/deviations.md). base: stored. peak: largest shown
-    lately"""
+    """opacity by which splats are pruned or replaced (docs/deviations.md). base: stored. peak: largest shown lately"""
     budget: int = 1_000_000
     """number of splats to grow to and to keep"""
     stop_at: int = 25_000

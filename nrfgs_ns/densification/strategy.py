@@ -92,8 +92,7 @@ class DensificationConfig(ABC):
     counts: ClassVar[tuple[str, ...]] = ("budget",)
     """options that are numbers of splats"""
     opacity_seen: OpacitySeen = "base"
-    """opacity by which splats are pruned, moved or replaced (docs/deviations.md). base: stored. peak: largest shown
-    lately"""
+    """opacity by which splats are pruned or replaced (docs/deviations.md). base: stored. peak: largest shown lately"""
     warmup_length: int = 500
     """step after which refinement begins"""
     refine_every: int = 100

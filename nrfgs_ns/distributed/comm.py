@@ -37,8 +37,7 @@ def swap(rows: Tensor, sent: list[int], received: list[int]) -> Tensor:
 
 
 def swap_counts(counts: Tensor) -> tuple[list[int], list[int]]:
-    """Tell each device how many rows it will get, given those that go to each, int64 [W]. Returns both numbers; the
-    host waits for them."""
+    """Tell each device how many rows it will get, given those for each, int64 [W]. Returns both; the host waits."""
     received = torch.empty_like(counts)
     dist.all_to_all_single(received, counts)
     return tuple(torch.stack([counts, received]).tolist())

@@ -33,8 +33,7 @@ def rows_of(rank: int, total: int, devices: int) -> slice:
 
 
 def map_model_rows(state: Mapping[str, Any], change: Callable[[Tensor], Any], prefix: str = "") -> dict[str, Any]:
-    """A model's state, its entries named after `prefix`, with each table of splats, and of densification's statistics,
-    changed."""
+    """A model's state, named after `prefix`, with each table of splats and of densification's statistics changed."""
     rows = f"{prefix}{PREFIX}"
     extra = state[f"{prefix}_extra_state"]
     statistics = per_splat_state(extra["strategy"], len(state[f"{rows}means"]))

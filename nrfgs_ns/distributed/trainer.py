@@ -82,8 +82,7 @@ class ShardedMean(ParameterMean):
 
 
 class ShardedGuard(Guard):
-    """The guard of one device. What stops one device, a signal included, stops all, at the same step and with one
-    message."""
+    """The guard of one device. What stops one, a signal included, stops all, at the same step with one message."""
 
     def __init__(self, pipeline, request: StopRequest):
         super().__init__(pipeline)

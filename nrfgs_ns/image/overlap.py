@@ -171,8 +171,8 @@ def spread(known: Tensor) -> float:
 
 
 def slope(pairs: Pairs, known: Tensor) -> float:
-    """Stops of brightness for a stop of known exposure (stops, NaN where unknown, [V]), by regression over the pairs, 0
-    to 1; 1 if there are too few of them."""
+    """Stops of brightness for one of known exposure ([V], NaN: unknown), by regression, 0 to 1; 1 with too few
+    pairs."""
     expected = known[pairs.second] - known[pairs.first]
     both = torch.isfinite(expected) & (expected.abs() > 0)
     expected, seen = expected[both].double(), pairs.shift[both, 0].double()

@@ -33,8 +33,7 @@ class Launcher:
         self.variants: dict[tuple, tuple[Any, tuple]] = {}
 
     def __call__(self, grid: tuple[int, int, int], *arguments: torch.Tensor | int | float, **constants: Any) -> None:
-        """Launch a grid of programs with plain arguments, the first of them a tensor, and constants, including the
-        compiler's options (num_warps, ...)."""
+        """Launch a grid of programs with plain arguments, the first a tensor, constants, and the compiler's options."""
         kinds: list[Any] = []
         plain: list[int | float] = []  # a tensor by its address: asked for it, Triton's launcher also asks the driver
         ordinary = True

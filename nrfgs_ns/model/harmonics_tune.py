@@ -52,8 +52,7 @@ def fine_tune(model, splats: PlainSplats, cameras: Cameras, steps: int | None = 
         return composite_view(view, of.seen_from(view), background, with_depth=False)[0]["rgb"]
 
     def squared_difference(index: int, sigma: float) -> torch.Tensor:
-        """Mean squared difference of the pictures from a random place beside a training camera, `sigma` off in each
-        coordinate."""
+        """Mean squared difference of the pictures from a random place, `sigma` off a training camera in each axis."""
         camera = no_larger(cameras[index : index + 1].to(model.device))
         offset = sigma * torch.randn(3, 1, generator=generator)
         camera.camera_to_worlds = camera.camera_to_worlds + pad(offset, (3, 0)).to(model.device)

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`nrfgs eval` and `nrfgs view`: what `ns-eval` reports, and nerfstudio's viewer, as `ns-viewer` opens it, also for a
-training or file from somebody else."""
+"""`nrfgs eval` and `nrfgs view`: as `ns-eval` and `ns-viewer`, also for a training or file from somebody else."""
 
 import json
 from dataclasses import dataclass

@@ -76,8 +76,7 @@ def find_data(config: "TrainerConfig", path: Path) -> None:
 
 
 def load_model(path: Path, mode: Literal["test", "inference"], measured: bool = False) -> "NrfgsPipeline":
-    """The pipeline of `load_training`; InputError also if it has no splats, or is to be measured and no test image has
-    pixels inside its mask."""
+    """The pipeline of `load_training`; InputError also without splats, or if masks leave nothing to be measured."""
     pipeline = load_training(path, mode).pipeline
     if pipeline.model.num_points == 0:
         raise InputError(f"{path}: this training has lost all splats. Train again with other options or data.")

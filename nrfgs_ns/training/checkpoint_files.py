@@ -33,8 +33,7 @@ class Damaged(ValueError):
 
 
 def allow_nerfstudio_checkpoints() -> None:
-    """Let `torch.load(weights_only=True)` read the numpy scalars in the state of nerfstudio's learning-rate schedulers.
-    These types are plain data."""
+    """Let `torch.load(weights_only=True)` read numpy scalars, plain data in the state of nerfstudio's schedulers."""
     scalar = np._core.multiarray.scalar
     older = scalar, "numpy.core.multiarray.scalar"
     torch.serialization.add_safe_globals([scalar, older, np.dtype, np.dtypes.Float64DType])
@@ -48,8 +47,7 @@ def find(folder: Path) -> dict[int, Path]:
 
 
 def write(folder: Path, step: int, content: dict[str, Any], only_latest: bool = True) -> Path:
-    """Write a checkpoint beside its folder, sync it to disk, move it in, and remove older ones; DiskFull where it
-    cannot be written."""
+    """Write a checkpoint beside its folder, sync it, move it in, and remove older ones; DiskFull where that fails."""
     folder.mkdir(parents=True, exist_ok=True)
     final = folder / f"step-{step:09d}.ckpt"
     # Beside the folder: nerfstudio's commands take every file within for a checkpoint. By a name that the next write

@@ -53,8 +53,7 @@ def data_set_of(names: list[str], cameras: Cameras) -> dict[str, Any]:
 
 
 def check_data_set(written: Mapping[str, Any], here: Mapping[str, Any], data: object, to_train: bool) -> None:
-    """Raise InputError where a checkpoint was trained on other images or intrinsics, which only a training minds, or
-    on other poses."""
+    """Raise InputError where a checkpoint had other poses or, if it is `to_train`, other images or intrinsics."""
     fix = "Go on with the data set that it was trained on, or train anew."
     if to_train and written["images"] != here["images"]:
         differ = sorted(set(written["images"]) ^ set(here["images"]))

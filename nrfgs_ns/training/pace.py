@@ -66,8 +66,7 @@ class Pace:
         self.position = min(self.position + self.rate, float(self.length))
 
     def step_at(self, position: float, now: int) -> int:
-        """The first step at or beyond a position, at the present rate; 0 if the position is behind. `now` is the
-        present step."""
+        """The first step, `now` or later, at or beyond a position at the present rate; 0 if the position is behind."""
         ahead = (position - self.position) / self.rate
         return now + math.ceil(ahead - ROUNDING) if ahead > -ROUNDING else 0
 

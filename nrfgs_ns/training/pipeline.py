@@ -200,8 +200,7 @@ class NrfgsPipeline(VanillaPipeline):
         return result
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Random generators, the order of the cameras and the data set, as numbers, strings and tensors, which torch
-        reads without trusting the file."""
+        """Random generators, order of the cameras and data set, as what torch reads without trusting the file."""
         return {
             "torch_rng": torch.get_rng_state(),
             "cuda_rng": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],

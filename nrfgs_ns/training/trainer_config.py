@@ -50,8 +50,7 @@ class NrfgsTrainerConfig(TrainerConfig):
     """steps for which schedules are given; they are stretched to the actual steps. None: max_num_iterations with a time
     budget, otherwise not stretched"""
     average_steps: int | None = None
-    """last steps over which parameters are averaged, at most a fiftieth of all. None: 200 if max_num_iterations is 0,
-    otherwise 0"""
+    """last steps to average parameters over, at most a fiftieth of all. None: 200 if max_num_iterations is 0, else 0"""
 
     def __post_init__(self) -> None:
         file = self.load_config  # all that ns-train takes, if it is given
@@ -180,8 +179,7 @@ class NrfgsTrainerConfig(TrainerConfig):
             raise InputError(f"vis is {self.vis}, which cannot start: {str(error).rstrip('.')}. {fix}") from error
 
     def save_config(self) -> None:
-        """Make the training's folder and save config.yml there, with absolute paths; InputError where it cannot be
-        written."""
+        """Make the training's folder and save config.yml there, with absolute paths; InputError where that fails."""
         data = self.pipeline.datamanager
         dataparser = replace(data.dataparser, data=_absolute(data.dataparser.data))
         pipeline = replace(self.pipeline, datamanager=replace(data, data=_absolute(data.data), dataparser=dataparser))
@@ -193,8 +191,7 @@ class NrfgsTrainerConfig(TrainerConfig):
             raise InputError(f"{self.get_base_dir()} cannot be written: {error}. Name another --output-dir.") from error
 
     def _take_a_folder(self) -> None:
-        """Make a folder for this training alone, numbering a name that is taken; a training that goes on from the last
-        checkpoint in its own folder keeps that."""
+        """Make a folder for this training alone, numbering a taken name; one that goes on in its own keeps it."""
         if (self.load_dir and self.load_dir.resolve(), self.load_step) == (self.get_checkpoint_dir().resolve(), None):
             return
         name = self.timestamp

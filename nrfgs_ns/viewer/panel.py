@@ -88,8 +88,7 @@ class ViewerPanel(ViewerControl):
         return isinstance(threading.current_thread(), RenderStateMachine)
 
     def _welcome(self, client) -> None:
-        """Move a browser to a little in front of the first training photograph: nerfstudio's own first view may see
-        nothing."""
+        """Move a browser to before the first training photograph: nerfstudio's own first view may see nothing."""
         photographs = list(getattr(self.viewer, "camera_handles", {}).values())
         if not photographs:  # until the first picture
             self.waiting.append(client)

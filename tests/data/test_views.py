@@ -115,8 +115,7 @@ def first_step(folder, factor, out, densification):
 @pytest.mark.parametrize("strategy", ["splatfacto", "original", "mcmc"])
 @pytest.mark.parametrize("factor", [2.0**-10, 2.0**10])
 def test_a_step_without_auto_scaling_is_the_same_in_any_unit(strategy, factor, tmp_path):
-    """Powers of two are exact: what differs is the rounding of log-scales and log distances, 2^-20 of what they scale,
-    some ten layers deep."""
+    """Powers of two are exact: what differs is the rounding of log-scales and log distances, 2^-20, ten layers deep."""
     densification = "mcmc,budget=200" if strategy == "mcmc" else strategy
     base, base_rgb, base_loss = first_step(tmp_path / "one", 1.0, tmp_path / "out", densification)
     other, rgb, loss = first_step(tmp_path / "other", factor, tmp_path / "out", densification)

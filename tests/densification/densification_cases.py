@@ -27,16 +27,14 @@ class Table:
 
     def __init__(self, count: int, opacity: float = 0.5, scale: float = 0.001):
         rows = torch.arange(count, dtype=torch.float32)[:, None]
-        self.splats = torch.nn.ParameterDict(
-            {
-                "means": Parameter(rows * torch.tensor([1.0, 0.0, 0.0])),
-                "scales": Parameter(torch.full((count, 3), scale).log()),
-                "quats": Parameter(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)),
-                "opacities": Parameter(torch.full((count, 1), logit(opacity))),
-                "features_dc": Parameter(rows.repeat(1, 3)),
-                "latents": Parameter(rows.repeat(1, 3)),
-            }
-        )
+        tables = {
+            "means": rows * torch.tensor([1.0, 0.0, 0.0]),
+            "scales": torch.full((count, 3), scale).log(),
+            "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+            "opacities": torch.full((count, 1), logit(opacity)),
+            **{name: rows.repeat(1, 3) for name in ("features_dc", "latents")},
+        }
+        self.splats = torch.nn.ParameterDict({name: Parameter(table) for name, table in tables.items()})
         self.optimizers = {name: torch.optim.Adam([value], lr=1e-9) for name, value in self.splats.items()}
         for name, value in self.splats.items():
             value.grad = torch.ones_like(value)

@@ -57,8 +57,7 @@ def test_the_peak_is_forgotten_at_refinement(name):
 # Heads whose opacity is the stored one.
 @pytest.mark.parametrize("name", STRATEGIES)
 def test_a_head_of_stored_opacity_cannot_tell_peak_from_base(name):
-    """Bit for bit, over three refinements, with opacities that wander across the thresholds in each step: 3DGS-MCMC and
-    the others are then what they are."""
+    """Bit for bit, over three refinements, with opacities that wander across the thresholds: 3DGS-MCMC stays itself."""
     ends = []
     budget = {"budget": 230} if name == "mcmc" else {}
     for seen in ("base", "peak"):

@@ -50,8 +50,7 @@ def meet(job: str, scene: Path, folder: Path, device_type: str = "cpu") -> Path:
 
 @pytest.fixture(scope="session")
 def two_devices(tiny_scene, tmp_path_factory) -> Path:
-    """The results of `jobs.everything` on two processes with gloo between them; of several processes of tests that
-    want them, the first makes them."""
+    """The results of `jobs.everything` on two processes with gloo; of several tests' processes the first makes them."""
     base = tmp_path_factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "two-devices"
     with FileLock(folder.with_suffix(".lock"), timeout=TIMEOUT):

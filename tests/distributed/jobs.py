@@ -18,8 +18,7 @@ AVERAGED = {
     "--pipeline.model.densification": f"{PEAK},stop_split_at=8",
     "--pipeline.sharding.rebalance-at": 100.0,
 }
-"""Of 12 steps, the mean begins at step 2. The only refinement is at step 4, and leaves the shards as unequal as it
-makes them."""
+"""Of 12 steps, the mean begins at step 2. The only refinement, at step 4, leaves the shards as it makes them."""
 
 
 def everything(scene: Path, folder: Path) -> None:
@@ -53,8 +52,7 @@ def after_each(trainer, do) -> None:
 
 
 def there_and_back(scene: Path, folder: Path) -> None:
-    """Checkpoints from two devices to one and to two again. Loading is looked at before anything is trained, and the
-    first checkpoint is evaluated by both."""
+    """Checkpoints from two devices to one and to two again, looked at before training; both evaluate the first."""
     world, main = dist.get_world_size(), dist.get_rank() == 0
     two = train(scene, folder / "half", world, 6, **BY_ERROR, **MORE)
     scores, half = [evaluation(two)], told(two)

@@ -118,10 +118,9 @@ def test_photographs_that_are_not_there_are_refused(words):
         read_tour(words, NAMES)
 
 
-@pytest.mark.parametrize(
-    "note, said",
-    [({}, "text"), ({"text": "x"}, "position"), ({"text": "x", "position": [0, 0, 0], "camera": {}}, "camera")],
-)
+@pytest.mark.parametrize("note, said", [
+    ({}, "text"), ({"text": "x"}, "position"), ({"text": "x", "position": [0, 0, 0], "camera": {}}, "camera"),
+])  # fmt: skip
 def test_notes_that_cannot_be_used_are_refused(note, said, tmp_path):
     (tmp_path / "notes.json").write_text(json.dumps({"notes": [note]}))
     with pytest.raises(InputError, match=said):

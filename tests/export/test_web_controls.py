@@ -17,11 +17,8 @@ pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
 
 pytest.importorskip("playwright.sync_api", reason="no playwright: pip install -e '.[browser]'")
 
-WINDOWS = {
-    "desktop": ((800, 560), {}),
-    "phone": ((360, 640), {"has_touch": True}),
-    "turned": ((640, 360), {"has_touch": True}),
-}
+TOUCH = {"has_touch": True}
+WINDOWS = {"desktop": ((800, 560), {}), "phone": ((360, 640), TOUCH), "turned": ((640, 360), TOUCH)}
 TABS = ["View", "Photographs", "Share", "Help"]
 LARGE = 44
 """CSS pixels that a fingertip needs."""

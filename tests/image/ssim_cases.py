@@ -7,8 +7,7 @@ from torch import Tensor
 
 ULP = 2.0**-24
 MOMENT_ROUNDINGS = 16
-"""A moment is two weighted sums of 11 numbers up to 1; errors of at most this many roundings have been seen or are to
-be expected, 22 being the bound."""
+"""Most roundings seen or expected in a moment, two weighted sums of 11 numbers up to 1; the bound is 22."""
 NOISE_VARIANCE = 0.05
 """Least D of the noisy images below: uniform noise has a variance of 1/12, and both images count."""
 TOLERANCE = 2 * MOMENT_ROUNDINGS * ULP / NOISE_VARIANCE

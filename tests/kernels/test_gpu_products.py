@@ -21,10 +21,8 @@ STEPS = 60
 
 
 def viewer_pictures(device: str, scene: Path, out: Path) -> dict[str, torch.Tensor]:
-    """The picture of every mode, and one whose view is frozen, moved to the CPU.
-
-    The field is drawn at random, the same on every device.
-    """
+    """The picture of every mode, and of a frozen view, on the CPU; the field is drawn at random, on all devices
+    alike."""
     words = "--pipeline.model.background-color black --pipeline.model.few-views off"
     words += " --pipeline.model.appearance.precision fp32"  # as on the CPU
     pipeline = untrained(scene, out, "nrfgs", *words.split(), device=device)

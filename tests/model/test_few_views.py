@@ -41,10 +41,7 @@ def test_copies_of_photographs_raise_no_trust(twice, tiny_scene, tmp_path, no_cu
     assert model.num_train_data == 16 and model.num_views == single.num_views == 8
     assert (model.trust, model.head.config) == (single.trust, single.head.config)
     assert model.noise_factor == single.noise_factor
-    assert_close(
-        shrinkage(model, model.gauss_params)["shrink_opacities"],
-        shrinkage(single, single.gauss_params)["shrink_opacities"],
-    )
+    assert_close(*(shrinkage(one, one.gauss_params)["shrink_opacities"] for one in (model, single)))
 
 
 def test_a_training_goes_on_with_the_views_that_it_counted(twice, tmp_path, no_cuda):

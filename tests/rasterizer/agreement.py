@@ -103,9 +103,8 @@ def _largest(t: Tensor) -> Tensor:
 
 
 def judge(case: Case, grads: tuple[Tensor, Tensor], unit: float = FLOAT32, **limits: Any) -> Verdict:
-    """Values and tolerances of everything a rasterizer computes for a case in an arithmetic of the given rounding
-    unit; limits: eps2d, floor and bounds of `reference.project`.
-    """
+    """Values and tolerances of everything a rasterizer computes for a case in an arithmetic of the given rounding unit;
+    limits: eps2d, floor and bounds of `reference.project`."""
     values, screens, images = _run(case, grads, unit, **limits)
     noise = torch.Generator().manual_seed(0)
     shaken = [_run(case, grads, unit, noise, [image.order for image in images], **limits)[0] for _ in range(RUNS)]

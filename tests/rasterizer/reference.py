@@ -18,8 +18,7 @@ from torch import Tensor
 MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE, TILE_SIZE = 1 / 255, 0.999, 1e-4, 16
 HELD = 4.0
 """Pixels. The arithmetic to be judged may hold positions about the centre of a tile this far from its sides: positions
-and their products then lose roundings of HELD and of HELD^2, however near a pixel is to a splat's centre.
-"""
+and their products then lose roundings of HELD and of HELD^2, however near a pixel is to a splat's centre."""
 
 
 @dataclass

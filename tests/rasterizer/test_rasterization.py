@@ -138,9 +138,7 @@ print(forward_and_backward(*map(int, sys.argv[1:])))
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [(1600, 1200), (800, 600)])
 def test_peak_memory_is_bounded(size):
-    """Forward and backward of 200,000 splats stay within 1 GiB above their inputs; in a fresh process, for its peak is
-    one's own.
-    """
+    """Forward and backward of 200,000 splats stay within 1 GiB above their inputs, in a process of their own."""
     command = [sys.executable, "-c", PEAK, "200000", *map(str, size)]
     assert float(subprocess.run(command, check=True, capture_output=True, text=True).stdout) < 1024
 

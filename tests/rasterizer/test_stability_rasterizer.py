@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Extremes of geometry and compositing: a splat at the end of its range, or beyond, among five ordinary ones.
-
-Everything runs on the CPU, and again on CUDA under the marker `gpu`.
-"""
+"""Extremes of geometry and compositing: a splat at the end of its range, or beyond, among five ordinary ones, on the
+CPU and under the marker `gpu` on CUDA."""
 
 import math
 
@@ -82,10 +80,8 @@ def test_log_scales_from_minus_40_to_plus_20(device, mode, exponent, shape, dept
 @modes
 @pytest.mark.parametrize("exponent", [15.0, 20.0, 38.0])
 def test_a_splat_of_planetary_size_is_an_even_veil(mode, exponent):
-    """sigma = d^2 / (2 (f s / z)^2) <= 50^2 / (2 * 6e7^2) = 3e-13: every pixel has the splat's own opacity.
-
-    In the antialiased mode the blur of 0.3 px takes nothing from it either.
-    """
+    """sigma = d^2 / (2 (f s / z)^2) <= 50^2 / (2 * 6e7^2) = 3e-13: every pixel has the splat's own opacity. In the
+    antialiased mode the blur of 0.3 px takes nothing from it either."""
     splats = cloud(count=1, means=[0.0, 0.0, 2.0], scales=[math.exp(exponent)] * 3, opacities=0.5)
     _, alpha, _ = assert_healthy(splats, rasterize_mode=mode)
     assert torch.allclose(alpha, torch.full_like(alpha, 0.5), rtol=0, atol=1e-6)
@@ -112,10 +108,8 @@ def test_far_to_the_side(device, mode, far, size):
 
 @pytest.mark.parametrize("coordinate", [1e-6, 1e6])
 def test_coordinates_of_1e_6_and_1e6(coordinate):
-    """The whole scene, camera included: sizes and depths in the same unit, so the image is the one of unit 1.
-
-    The near plane would cut the small one off: it is a length too, and is given in the same unit.
-    """
+    """The whole scene, camera included: sizes and depths in the same unit, so the image is the one of unit 1. The near
+    plane would cut the small one off: it is a length too, and is given in the same unit."""
     reference, splats = render(cloud())[0].detach()[..., :3], cloud()
     for name in ("means", "scales"):
         splats[name] = (splats[name].detach() * coordinate).requires_grad_()
@@ -255,10 +249,8 @@ def test_large_colours(device, color):
 
 @pytest.mark.slow
 def test_indices_of_16_million_splats():
-    """2^24 is where float32 stops to count: every splat is listed once, in its own tile, with its own slot.
-
-    One splat in each sub-tile of an image of 32,768 x 32,768 pixels: 2^24 footprints, 2^24 pairs.
-    """
+    """2^24 is where float32 stops to count: every splat is listed once, in its own tile, with its own slot. One splat
+    in each sub-tile of an image of 32,768 x 32,768 pixels: 2^24 footprints, 2^24 pairs."""
     edge, side = tiles.SUB_TILE, 4096
     count = side * side
     row, column = torch.arange(count) // side, torch.arange(count) % side

@@ -147,8 +147,7 @@ def test_the_trained_model_is_the_mean(averaged):
 
 
 def test_averaging_changes_no_step(averaged, tiny_scene, tmp_path):
-    """A training without it ends where one with it was before the mean took its place, moments included, and its
-    checkpoint has nothing more than before."""
+    """A training without it ends where one with it was before the mean took its place, moments included."""
     plain = checkpoint_of(trained(command_line("nrfgs", tiny_scene, tmp_path, 12, CALM)))
     last = {f"_model.{name}": value for name, value in averaged.after[11].items()}
     assert_close({name: plain["pipeline"][name] for name in last}, last, rtol=0, atol=0)

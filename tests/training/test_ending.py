@@ -30,10 +30,9 @@ from nrfgs_ns.training.trainer import NrfgsTrainer, writer
 pytestmark = pytest.mark.usefixtures("no_cuda", "any_share")
 
 STEPS = 12
+RULES = Splatfacto(warmup_length=2, refine_every=4, reset_alpha_every=100, densify_grad_thresh=1e-6)
 BUSY = {
-    "--pipeline.model.densification": Splatfacto(
-        warmup_length=2, refine_every=4, reset_alpha_every=100, densify_grad_thresh=1e-6
-    ),
+    "--pipeline.model.densification": RULES,
     "--pipeline.model.num-downscales": 0,
     "--steps-per-eval-image": 5,
     "--steps-per-eval-all-images": 5,
@@ -299,10 +298,9 @@ def test_what_is_ignored_stays_so():
         signal.signal(signal.SIGHUP, before)
 
 
-@pytest.mark.parametrize(
-    ("second", "seconds", "ends"),
-    [(signal.SIGINT, 0.1, False), (signal.SIGINT, 2.0, True), (signal.SIGTERM, 2.0, False)],
-)
+@pytest.mark.parametrize(("second", "seconds", "ends"), [
+    (signal.SIGINT, 0.1, False), (signal.SIGINT, 2.0, True), (signal.SIGTERM, 2.0, False),
+])  # fmt: skip
 def test_only_a_second_ctrl_c_stops_at_once(second, seconds, ends, monkeypatch):
     """A first one that is heard twice, from the terminal and from a parent process, is no second one."""
     now, ended = [5.0], []

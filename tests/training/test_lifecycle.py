@@ -26,10 +26,9 @@ from nrfgs_ns.training.checkpoint_files import read_latest
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
+RULES = Splatfacto(warmup_length=2, refine_every=4, reset_alpha_every=6, densify_grad_thresh=1e-6, stop_split_at=100)
 BUSY = {
-    "--pipeline.model.densification": Splatfacto(
-        warmup_length=2, refine_every=4, reset_alpha_every=6, densify_grad_thresh=1e-6, stop_split_at=100
-    ),
+    "--pipeline.model.densification": RULES,
     "--pipeline.model.resolution-schedule": 10,
     "--pipeline.model.num-downscales": 1,
     "--pipeline.model.few-views": "off",

@@ -101,10 +101,9 @@ def test_steps_of_positions():
     assert pace.position == LENGTH
 
 
+RULES = "splatfacto,warmup_length=8,refine_every=2,reset_alpha_every=100,densify_grad_thresh=1e-6,stop_split_at=30"
 SCHEDULES = {
-    "--pipeline.model.densification": (
-        "splatfacto,warmup_length=8,refine_every=2,reset_alpha_every=100,densify_grad_thresh=1e-6,stop_split_at=30"
-    ),
+    "--pipeline.model.densification": RULES,
     "--pipeline.model.resolution-schedule": 10,
     "--pipeline.model.num-downscales": 1,
 }
@@ -161,8 +160,7 @@ class SecondsAStep(TimedPace):
 
 @pytest.mark.usefixtures("no_cuda")
 def test_a_training_ends_when_its_time_is_up(tiny_scene, tmp_path, monkeypatch):
-    """The checkpoint is named after the last step, going on from it with the same budget is refused, and with six more
-    seconds it makes six more steps."""
+    """It is saved by its last step's name, refuses the same budget, and makes six more steps of six more seconds."""
     monkeypatch.setattr(trainer_config, "TimedPace", SecondsAStep)
 
     def run(name, minutes, *more):
@@ -208,9 +206,8 @@ def test_chosen_steps_are_made_and_resuming_goes_on_to_their_end(tiny_scene, tmp
 
     whole = train_on("whole", 0, {"--steps-per-save": 5})
     said = " ".join(capsys.readouterr().out.split())
-    assert re.search(
-        r"8 training views: 12 steps, view dependence reduced to 0.29, .*nothing drawn nearer than \d", said
-    )
+    chosen = r"8 training views: 12 steps, view dependence reduced to 0.29, .*nothing drawn nearer than \d"
+    assert re.search(chosen, said)
     last = {"--load-dir": models_of(whole)}
     assert checkpoint_of(train_on("rest", 0, last, {"--load-step": 10}))["step"] == checkpoint_of(whole)["step"] == 11
     with pytest.raises(InputError, match="end of a training of 12 steps: --max-num-iterations 24 --schedule-steps 30"):

@@ -90,11 +90,7 @@ def test_where_nothing_can_listen_is_told(open_viewer, pipeline, options, says):
 @pytest.mark.parametrize("path", [
     "/../../../../../../../../../../etc/passwd",
     "/%2e%2e/%2e%2e/%2e%2e/%2e%2e/%2e%2e/%2e%2e/etc/passwd",
-    "/../__init__.py",
-    "/assets",
-    "/a\0b",
-    "/" + "a" * 5000,
-    "http://elsewhere/index.html",
+    "/../__init__.py", "/assets", "/a\0b", "/" + "a" * 5000, "http://elsewhere/index.html",
 ])  # fmt: skip
 def test_no_file_outside_the_page_is_served(to_all, interface, path):
     status, body = answer(interface, to_all.viser_server.get_port(), path)
@@ -121,27 +117,14 @@ def test_pages_of_other_origins_are_refused(to_all, interface):
     assert upgrade(interface, port) == 101, "no browser's page"
     assert upgrade(interface, port, f"Origin: http://{interface}:{port}") == 101
     assert upgrade(interface, port, f"Origin: https://{interface}:{port}") == 101, "behind a proxy"
-    for origin in (
-        "http://evil.example",
-        "https://viewer.nerf.studio",
-        "null",
-        f"http://{interface}",
-        f"http://{interface}:{port + 1}",
-        f"http://evil.example://{interface}:{port}",
-    ):
+    others = ["http://evil.example", "https://viewer.nerf.studio", "null", f"http://{interface}"]
+    for origin in (*others, f"http://{interface}:{port + 1}", f"http://evil.example://{interface}:{port}"):
         assert upgrade(interface, port, f"Origin: {origin}") == 403, origin
         assert answer(interface, port, "/", f"Origin: {origin}")[0] == 403, origin
 
 
-CAMERA = {
-    "type": "ViewerCameraMessage",
-    "wxyz": [1.0, 0.0, 0.0, 0.0],
-    "position": [0.0, 0.0, -3.0],
-    "fov": 0.9,
-    "aspect": 4 / 3,
-    "look_at": [0.0, 0.0, 0.0],
-    "up_direction": [0.0, -1.0, 0.0],
-}
+CAMERA = {"type": "ViewerCameraMessage", "wxyz": [1.0, 0.0, 0.0, 0.0], "position": [0.0, 0.0, -3.0]}
+CAMERA |= {"fov": 0.9, "aspect": 4 / 3, "look_at": [0.0, 0.0, 0.0], "up_direction": [0.0, -1.0, 0.0]}
 
 
 def send(port: int, messages: list, until=lambda: True, heard=None) -> None:

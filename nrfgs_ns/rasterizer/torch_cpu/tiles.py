@@ -190,8 +190,7 @@ def split_into_blocks(footprints: Footprints, max_pairs: int) -> list[Block]:
 
 
 def list_tiles(footprints: Footprints, block: Block) -> TileLists:
-    """List the splats of each sub-tile of a block, front to back: each splat is expanded into rows, each row into
-    columns."""
+    """List the splats of each sub-tile of a block, front to back: splats are expanded into rows, rows into columns."""
     row0, row1, col0, col1 = _clip(footprints.spans, block)
 
     # (splat, row) pairs, splat by splat.
