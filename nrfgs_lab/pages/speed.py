@@ -8,7 +8,8 @@ import numpy as np
 
 from nrfgs_lab.pages.runs import records, span
 
-RENDERERS = {"nrfgs": "`nrfgs`", "nrfgs-sh": "`nrfgs-sh`", "splatfacto": "splatfacto", "faster-gs": "Faster-GS, bare"}
+RENDERERS = {"nrfgs": "`nrfgs`", "nrfgs-sh": "`nrfgs-sh`", "splatfacto": "splatfacto"}
+RENDERERS |= {"gsplat": "gsplat, bare", "faster-gs": "Faster-GS, bare"}
 
 
 def scale_cells(column: str) -> dict[tuple[int, float], dict[str, list[float]]]:
