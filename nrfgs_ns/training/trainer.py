@@ -232,9 +232,9 @@ class NrfgsTrainer(Trainer):
             pace.begin_step()
             model.densification.reschedule(lambda position: pace.step_at(position, step))
         with self._last_good_state_on_disk():
-            pull = {} if self.twin is None else self.twin.make_step(step)
+            pulled = {} if self.twin is None else self.twin.make_step(step)
             is_logged = step % self.config.logging.steps_per_log == 0
-            loss, losses, metrics = descend(self, step, pull, is_logged)
+            loss, losses, metrics = descend(self, step, pulled, is_logged)
             optimizers.scheduler_step_all(step)
         self._completed_step = step
         if pace is not None:
