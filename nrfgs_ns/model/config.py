@@ -44,8 +44,8 @@ class NrfgsModelConfig(ModelConfig):
     dense_start: Literal["auto", "off"] = "off"
     """auto: start with points from the photographs, too, the more the fewer there are (docs/captures.md)"""
     twin: Literal["auto", "on", "off"] = "off"
-    """train a second model beside the first, with which it must agree between the cameras. auto: on a GPU, where views
-    are few (docs/captures.md)"""
+    """train a second model beside the first, with which it must agree between the cameras. auto: on one GPU, where
+    views are few (docs/captures.md)"""
     near_plane: Literal["auto", "off"] = "off"
     """auto: draw nothing nearer than half the depth of the capture's nearest points (docs/captures.md). off: nothing
     nearer than 0.01 scene units, as in splatfacto"""

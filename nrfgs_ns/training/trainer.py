@@ -187,10 +187,7 @@ class NrfgsTrainer(Trainer):
     def train(self) -> None:
         """Train. Raises TrainingStopped where a number is not finite or memory has run out, and SystemExit with the
         status of a signal; the last good state has been written."""
-        with self._last_good_state_on_disk():
-            for training in self._trainings:
-                training.guard.step = self._start_step
-                training.guard.check_parameters(training.optimizers)
+        self._check_parameters(self._start_step)
         if isinstance(self.pace, TimedPace):  # the clock says which step is the last
             self.config = replace(self.config, max_num_iterations=sys.maxsize // 2)
         if self.line is not None:
@@ -232,9 +229,9 @@ class NrfgsTrainer(Trainer):
             pace.begin_step()
             model.densification.reschedule(lambda position: pace.step_at(position, step))
         with self._last_good_state_on_disk():
-            pull = {} if self.twin is None else self.twin.make_step(step)
+            pulled = {} if self.twin is None else self.twin.make_step(step)
             is_logged = step % self.config.logging.steps_per_log == 0
-            loss, losses, metrics = descend(self, step, pull, is_logged)
+            loss, losses, metrics = descend(self, step, pulled, is_logged)
             optimizers.scheduler_step_all(step)
         self._completed_step = step
         if pace is not None:
@@ -359,16 +356,22 @@ class NrfgsTrainer(Trainer):
     def save_checkpoint(self, step: int) -> None:
         """Write a checkpoint of finite numbers, or raise TrainingStopped, with the last good state on disk. Where the
         disk is full the training goes on with a warning, except at its end: DiskFull."""
-        with self._last_good_state_on_disk():
-            for training in self._trainings:
-                training.guard.settle()
-                training.guard.check_parameters(training.optimizers)
+        self._check_parameters(step)
         try:
             self._write_checkpoint(step)
         except DiskFull as full:
             if self._is_ending:
                 raise
             warn(f"{full} The training goes on.")
+
+    def _check_parameters(self, step: int) -> None:
+        """Read the guards' last verdicts and check all parameters; TrainingStopped, with the last good state on disk,
+        where a number is not finite."""
+        with self._last_good_state_on_disk():
+            for training in self._trainings:
+                training.guard.settle()
+                training.guard.step = step
+                training.guard.check_parameters(training.optimizers)
 
     @contextmanager
     def _last_good_state_on_disk(self) -> Iterator[None]:

@@ -110,10 +110,9 @@ class NrfgsTrainerConfig(TrainerConfig):
                 raise InputError(f"{name} is {value}; it must be {least}, and below 2^32.")
         if devices == 1 and self.machine.device_type == "cuda" and not torch.cuda.is_available():
             raise InputError("machine.device_type is cuda, but PyTorch finds no GPU (`nrfgs doctor`). Give cpu.")
-        if devices > 1 and (self.time_budget or self.schedule_steps) is not None:
-            raise InputError("time_budget and schedule_steps are for one device. Leave them out.")
-        if devices > 1 and self.pipeline.model.twin == "on":
-            raise InputError("pipeline.model.twin is for one device. Leave it out.")
+        has_twin = self.pipeline.model.twin == "on"
+        if devices > 1 and (has_twin or (self.time_budget or self.schedule_steps) is not None):
+            raise InputError("time_budget, schedule_steps and pipeline.model.twin are for one device. Leave them out.")
         check_types(self.pipeline, "config.yml", "pipeline.")
         self.pipeline.model.check()
         if self.load_step is not None and self.load_dir is None:

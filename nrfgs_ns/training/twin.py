@@ -3,8 +3,8 @@
 
 Two trainings of one capture from two seeds show the same where the photographs decide what is there. Elsewhere each
 makes up its own (CoR-GS: Zhang et al. 2024). So every few steps each model also descends the photometric loss of a view
-between two training cameras, with the other model's picture of that view as the photograph. The twin is not kept when
-the training is over.
+between two training cameras, with the other model's picture of that view as the photograph. Checkpoints hold both, for
+the training to go on; commands read the first.
 """
 
 import math
@@ -34,7 +34,7 @@ EVERY = 2
 VIEWS = 50.0
 """Training views with which agreements are e times as rare."""
 RAREST = 6
-"""Steps between agreements from which a twin is not worth its time."""
+"""Steps between agreements, with more than 50 training views, from which a twin is not worth its time."""
 NEIGHBOURS = 4
 """Training cameras that count as neighbours of one."""
 TURN = 3.0
@@ -60,7 +60,7 @@ class Between:
         centers, backward = cameras.camera_to_worlds[..., 3], cameras.camera_to_worlds[..., 2]
         self.spacing = camera_spacing(centers)
         places = torch.cat([centers / max(self.spacing, 1e-12), TURN * backward], dim=1)
-        distances = torch.cdist(places, places).fill_diagonal_(math.inf)
+        distances = torch.cdist(places, places, compute_mode="donot_use_mm_for_euclid_dist").fill_diagonal_(math.inf)
         count = max(min(NEIGHBOURS, len(cameras) - 1), 1)
         self.neighbours = distances.topk(count, largest=False).indices.tolist()
 
@@ -89,7 +89,7 @@ class Twin:
     world_size = 1
 
     def __init__(self, trainer, every: int):
-        self.first, self.every, model = trainer, every, trainer.pipeline.model
+        self.trainer, self.every, model = trainer, every, trainer.pipeline.model
         self.between = Between(trainer.pipeline.datamanager.train_dataset.cameras)
         given = {"scene_box": model.scene_box, "num_train_data": model.num_train_data, **model.kwargs}
         with torch.random.fork_rng(devices=[]):
@@ -108,16 +108,15 @@ class Twin:
 
     def begin(self) -> None:
         """Prepare for the first step, once a checkpoint has been loaded."""
-        for model in (self.first.pipeline.model, self.pipeline.model):
+        for model in (self.trainer.pipeline.model, self.pipeline.model):
             model.densification.trainings = 2
-        self.callbacks = self.pipeline.model.get_training_callbacks(
-            TrainingCallbackAttributes(self.optimizers, None, self.pipeline, None)
-        )
+        attributes = TrainingCallbackAttributes(self.optimizers, None, self.pipeline, None)
+        self.callbacks = self.pipeline.model.get_training_callbacks(attributes)
 
     def make_step(self, step: int) -> Gradients:
         """Make the twin's step; returns what the first model's gradients are to be increased by."""
-        model, first = self.pipeline.model, self.first.pipeline.model
-        if (pace := self.first.pace) is not None:
+        model, first = self.pipeline.model, self.trainer.pipeline.model
+        if (pace := self.trainer.pace) is not None:
             model.schedule_at(first.schedule_step)
             model.densification.reschedule(lambda position: pace.step_at(position, step))
         self._call_back(step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
@@ -125,9 +124,9 @@ class Twin:
         if step % self.every == 0 and first.schedule_step >= START and first._get_downscale_factor() == 1:
             view = self.between.draw(Random(f"{first._seed} {step}"))
             pictures = picture(model, view), picture(first, view)
-            pulls = [pull(each, view, seen, step) for each, seen in zip((self.first, self), pictures, strict=True)]
+            pulls = [pull(each, view, seen, step) for each, seen in zip((self.trainer, self), pictures, strict=True)]
         for name, optimizer in self.optimizers.optimizers.items():
-            optimizer.param_groups[0]["lr"] = self.first.optimizers.optimizers[name].param_groups[0]["lr"]
+            optimizer.param_groups[0]["lr"] = self.trainer.optimizers.optimizers[name].param_groups[0]["lr"]
         descend(self, step, pulls[1])
         self._call_back(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
         return pulls[0]
@@ -151,25 +150,19 @@ class Twin:
 def twin_of(trainer) -> Twin | None:
     """The twin that a trainer's configuration asks for (`NrfgsModelConfig.twin`), if any."""
     model, config = trainer.pipeline.model, trainer.config
-    every = steps_between(model.num_views)
+    every = min(round(EVERY * math.exp(min(model.num_views / VIEWS, 2.0) ** 2)), RAREST)
     is_long = config.time_budget is None and (config.schedule_steps or config.max_num_iterations) > START
-    suits = every > 0 and is_long and model.device.type == "cuda" and model.camera_optimizer.config.mode == "off"
+    suits = every < RAREST and is_long and model.device.type == "cuda" and model.camera_optimizer.config.mode == "off"
     is_wanted = model.config.twin == "on" or model.config.twin == "auto" and suits
-    return Twin(trainer, every or RAREST) if is_wanted else None
+    return Twin(trainer, every) if is_wanted else None
 
 
-def steps_between(views: int) -> int:
-    """Steps from one agreement to the next with this number of training views; 0: a twin is not worth its time."""
-    every = EVERY * math.exp(min((views / VIEWS) ** 2, 9.0))
-    return round(every) if every < RAREST else 0
-
-
-def descend(training, step: int, pull: Gradients, with_metrics: bool = False) -> tuple[Tensor, dict, dict]:
+def descend(training, step: int, pulled: Gradients, with_metrics: bool = False) -> tuple[Tensor, dict, dict]:
     """Make the step of a trainer or of a twin, down the loss of its next photograph.
 
     Args:
         training: has `pipeline`, `guard`, `optimizers`, `graphs` (None: steps are not recorded) and `world_size`.
-        pull: added to the gradients.
+        pulled: added to the gradients.
 
     Returns:
         the loss, its terms, and metrics if wanted.
@@ -181,7 +174,7 @@ def descend(training, step: int, pull: Gradients, with_metrics: bool = False) ->
     loss = reduce(torch.add, losses.values())
     if loss.requires_grad:  # a recorded step has made its gradients already
         loss.backward(torch.full_like(loss, 1.0 / training.world_size))  # the mean of the devices' losses
-    for parameter, gradient in pull.items():
+    for parameter, gradient in pulled.items():
         parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
     training.guard.before_optimizers(optimizers)
     optimizers.step()
@@ -197,8 +190,8 @@ def pull(training, view: Cameras, seen: Tensor, step: int) -> Gradients:
     else:
         optimizers.zero_grad_all()
         loss_of(model, model.gauss_params, model.get_outputs(view), batch, True)["main_loss"].backward()
-    pulled = [name for name in optimizers.optimizers if name in PULLED or "field" not in optimizers.optimizers]
-    parameters = [p for name in pulled for p in parameters_of(optimizers.optimizers[name])]
+    names = [name for name in optimizers.optimizers if name in PULLED or "field" not in optimizers.optimizers]
+    parameters = [p for name in names for p in parameters_of(optimizers.optimizers[name])]
     # The next graph that runs writes where this one's gradients are.
     return {parameter: parameter.grad.clone() for parameter in parameters if parameter.grad is not None}
 

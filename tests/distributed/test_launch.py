@@ -64,7 +64,7 @@ def test_scaled_gradients_are_refused(config, option):
 
 def test_a_twin_is_refused(config):
     config = replace(config, pipeline=replace(config.pipeline, model=replace(config.pipeline.model, twin="on")))
-    with pytest.raises(InputError, match="twin is for one device"):
+    with pytest.raises(InputError, match="model.twin are for one device"):
         config.setup(local_rank=0, world_size=2)
 
 
