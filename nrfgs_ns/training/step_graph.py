@@ -90,7 +90,8 @@ class StepGraphs:
 
     def _is_one_too_many(self, batch: Mapping[str, Any]) -> bool:
         """Whether the photograph is of a kind that has no graph and gets none."""
-        if len(self._graphs) < MOST_SIZES or _kind(batch) in self._graphs:
+        alike = [kind for kind in self._graphs if kind[-1] == ("between" in batch)]
+        if len(alike) < MOST_SIZES or _kind(batch) in alike:
             return False
         return not self.model.densification.rests_at(self.model.step) or memory.share_used(self.model.device) > 0.5
 

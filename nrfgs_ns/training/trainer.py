@@ -163,10 +163,11 @@ class NrfgsTrainer(Trainer):
             self.pipeline.model.schedule_at(int(self.pace.position))
         if self.mean is not None and self.mean.is_saved and training.get("parameter_mean") is not None:
             self.mean.load_state(training["parameter_mean"], self.optimizers.optimizers)
-        if self.twin is not None and "twin" in training:
-            self.twin.load_state(training["twin"])
-        else:
+        if self.twin is not None and "twin" not in training:
+            warn("The checkpoint is of a training without a twin, which goes on without one.")
             self.twin = None
+        elif self.twin is not None:
+            self.twin.load_state(training["twin"])
         budget = config.time_budget
         total = f"{self.total_steps:,}" if budget is None else f"as many as fit into {budget:g} minutes"
         CONSOLE.print(f"Going on from {path}, at step {self._start_step} of {total}.", markup=False, soft_wrap=True)

@@ -39,6 +39,7 @@ def test_a_photograph_of_one_size_too_many_has_no_graph_and_it_is_said(build, mo
     graphs._graphs = {((height, 4, 3), False, False): None for height in range(5, 5 + MOST_SIZES)}
     assert graphs._obstacle({"image": torch.zeros(5, 4, 3)}) is None
     assert "many sizes" in graphs._obstacle({"image": torch.zeros(4, 4, 3)})
+    assert graphs._obstacle({"image": torch.zeros(4, 4, 3), "between": True}) is None  # a twin's picture
     pipeline.model.step = 29_000  # growth has ended
     assert graphs._obstacle({"image": torch.zeros(4, 4, 3)}) is None
     monkeypatch.setattr(memory, "share_used", lambda device: 0.6)
@@ -115,7 +116,7 @@ def test_graphs_of_replaced_splats_are_freed_while_steps_are_not_recorded(build,
     model, batch = pipeline.model, pipeline.datamanager.train_view(0)[1]
     monkeypatch.setattr(type(model), "device", torch.device("cuda"))
     graphs._drop_if_outdated()
-    graphs._graphs = {None: SimpleNamespace(most_pairs=lambda: 2, count=1)}
+    graphs._graphs = {((9, 9, 3), False, False): SimpleNamespace(most_pairs=lambda: 2, count=1)}
     model.step = 499
     assert graphs._can_record(batch) and graphs._graphs
     model.step = 500

@@ -44,11 +44,12 @@ def test_a_training_with_a_twin_goes_on_from_its_checkpoint(method, tiny_scene, 
     assert not both[0]["pipeline"]["_model.gauss_params.means"].equal(twins[0]["model"]["gauss_params.means"])
 
 
-def test_a_checkpoint_without_a_twin_goes_on_alone(tiny_scene, tmp_path, no_cuda):
+def test_a_checkpoint_without_a_twin_goes_on_alone(tiny_scene, tmp_path, no_cuda, capsys):
     alone = trained(command_line("nrfgs", tiny_scene, tmp_path / "alone", 4, BESIDE, {"--pipeline.model.twin": "off"}))
     assert "twin" not in checkpoint_of(alone)["training"]
     trainer = set_up(command_line("nrfgs", tiny_scene, tmp_path / "more", 6, BESIDE, {"--load-dir": models_of(alone)}))
     assert trainer.twin is None and trainer.pipeline.model.densification.trainings == 1
+    assert "goes on without one" in capsys.readouterr().out
 
 
 def test_a_checkpoint_is_of_a_twin_of_finite_numbers(tiny_scene, tmp_path, no_cuda):
