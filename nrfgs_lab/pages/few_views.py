@@ -51,10 +51,10 @@ def twin_gain(trial: str, base: str) -> str:
     return f"{gain} (better on {better}), {signed(fmean(worst), 1)} dB in the worst view"
 
 
-def twin_time() -> str:
-    """Least and most that the seconds of a training grow by a twin, of pairs in one sitting."""
+def twin_cost(of: str) -> str:
+    """Least and most by which a twin multiplies a training's seconds or peak memory, of pairs in one sitting."""
     pairs = [*twins("twin", "alone"), *twins("harmonics", "harmonics_alone")]
-    return span([one["train"]["seconds"] / other["train"]["seconds"] for one, other in pairs], "{:.1f}".format)
+    return span([one["train"][of] / other["train"][of] for one, other in pairs], "{:.1f}".format)
 
 
 def ahead(gains: list[float], digits: int = 1) -> str:
@@ -178,7 +178,7 @@ BLOCKS = {
     "readme.demo": demo,
     "captures.rules_gain": rules_gain,
     "captures.twin": twin_gain,
-    "captures.twin_time": twin_time,
+    "captures.twin_cost": twin_cost,
     "captures.floaters": floaters,
     "captures.today": lambda *place: _run({of: mean(today(*place), of) for of in ("psnr", "ssim", "splats")}),
     "captures.sparse": sparse,
