@@ -285,6 +285,15 @@ class NrfgsModel(ExportedModel):
         view = self.project(camera)
         return self.composite(view, self.field.base_of(view))[0]["rgb"]
 
+    def picture(self, view: View, field: Field, look: Callable[[Tensor], Tensor] | None) -> Tensor:
+        """A rendering as a photograph for a twin (`training/twin.py`), uint8 [H, W, 4], transparent where nothing is
+        drawn; [H, W, 3] over black where photographs' exposures are learnt, which are not of transparent ones."""
+        outputs, _ = self.composite(view, field.seen_from(view), torch.zeros(3, device=self.device), look)
+        rgb, alpha = outputs["rgb"], outputs["accumulation"]
+        if self.photograph is None:
+            rgb = torch.cat([rgb / alpha.clamp_min(1e-6), alpha], dim=-1)
+        return (255 * rgb).round().clamp(0, 255).byte()
+
     def set_background(self, background_color: Tensor) -> None:
         """Set the background [3] of the viewer's pictures alone: evaluation keeps its own."""
         if self.viewer_panel is not None:

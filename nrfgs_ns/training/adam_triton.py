@@ -8,7 +8,6 @@ the device in each step, because the gradients' addresses change.
 The equations are torch's (Kingma and Ba 2015), in float32; the bias corrections in float64.
 """
 
-import functools
 from typing import Any
 
 import numpy as np
@@ -184,6 +183,3 @@ class AdamTable:
         self.fixed = fixed
         self.programs = int(programs.sum())
         return True
-
-
-table_on = functools.cache(AdamTable)

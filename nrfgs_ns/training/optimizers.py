@@ -37,6 +37,8 @@ class LeanOptimizers(Optimizers):
         super().__init__(config, param_groups)
         self.steps_per_log = steps_per_log
         self.pace = pace
+        self._tables: dict[torch.device, Any] = {}
+        """not shared with a twin's, since the host waits for the copy of the last step's"""
         self.fuse()
 
     def fuse(self) -> None:
@@ -64,7 +66,7 @@ class LeanOptimizers(Optimizers):
     def step(self) -> None:
         """One step of all optimisers."""
         plain = [optimizer for name, optimizer in self.optimizers.items() if self._is_plain(name)]
-        stepped = plain if step_at_once(plain) else []
+        stepped = plain if step_at_once(plain, self._tables) else []
         for name, optimizer in self.optimizers.items():
             if optimizer not in stepped:
                 if (max_norm := self.config[name]["optimizer"].max_norm) is not None:
@@ -121,9 +123,10 @@ class LeanOptimizers(Optimizers):
                 group["lr"] = rate
 
 
-def step_at_once(optimizers: Sequence[Adam]) -> bool:
+def step_at_once(optimizers: Sequence[Adam], tables: dict[torch.device, Any]) -> bool:
     """Make one step of several fused Adams that have state by one Triton kernel, if it runs; returns whether it did. As
-    in torch, the step changes nothing where the optimisers' `found_inf`, a tensor on the device, is 1."""
+    in torch, the step changes nothing where the optimisers' `found_inf`, a tensor on the device, is 1. `tables` keeps
+    the device's `AdamTable`."""
     work: list[tuple[dict[str, Any], list[Tensor], list[dict[str, Tensor]]]] = []
     for optimizer in optimizers:
         for group in optimizer.param_groups:
@@ -134,12 +137,14 @@ def step_at_once(optimizers: Sequence[Adam]) -> bool:
     skips = [getattr(optimizer, "found_inf", None) for optimizer in optimizers]
     if device.type != "cuda" or any(skip is not skips[0] for skip in skips) or not try_kernel(device):
         return False
-    from nrfgs_ns.training.adam_triton import table_on
+    from nrfgs_ns.training.adam_triton import AdamTable
 
     counters = [state["step"] for _, _, states in work for state in states]
     with torch.no_grad():
         torch._foreach_add_(counters, 1)
-        done = table_on(device).step(work, skips[0])
+        if device not in tables:
+            tables[device] = AdamTable(device)
+        done = tables[device].step(work, skips[0])
         if not done:
             torch._foreach_sub_(counters, 1)
     return done

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rendering, loss and gradients of a training step as one CUDA graph.
+"""Rendering, loss and gradients of a training step as one CUDA graph, and a twin's picture as another.
 
 A step launches a hundred kernels, and the host takes longer to launch them than a GPU takes to run them: 4 ms against
 2 ms at 250,000 splats. Between two refinements each step does the same to the same tensors. So it is recorded once,
@@ -12,9 +12,9 @@ host learns it a step later and makes more room.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -27,7 +27,7 @@ from nrfgs_ns.data.checks import warn
 from nrfgs_ns.densification import memory
 from nrfgs_ns.image.metrics import WINDOW_SIZE
 from nrfgs_ns.model.loss import loss_of
-from nrfgs_ns.rasterizer import Pinhole, composite_view, project_view
+from nrfgs_ns.rasterizer import Pinhole, View, composite_view, project_view
 
 MORE_ROOM = 1.5
 """Room for (splat, tile) pairs, relative to the view that has most."""
@@ -49,7 +49,7 @@ class StepGraphs:
 
     def __init__(self, model, datamanager, guard):
         self.model, self.datamanager, self.guard = model, datamanager, guard
-        self._graphs: dict[tuple, _StepGraph] = {}
+        self._graphs: dict[_Kind, _StepGraph] = {}
         self._recorded: list[Any] = []
         """the splats' parameters and the head that the graphs hold, kept so that their ids stay theirs"""
         self._settings: dict[str, Any] = {}
@@ -90,8 +90,9 @@ class StepGraphs:
 
     def _is_one_too_many(self, batch: Mapping[str, Any]) -> bool:
         """Whether the photograph is of a kind that has no graph and gets none."""
-        alike = [kind for kind in self._graphs if kind[-1] == ("between" in batch)]
-        if len(alike) < MOST_SIZES or _kind(batch) in alike:
+        kind = _kind(batch)
+        alike = [other for other in self._graphs if other.sort == kind.sort]
+        if len(alike) < MOST_SIZES or kind in alike:
             return False
         return not self.model.densification.rests_at(self.model.step) or memory.share_used(self.model.device) > 0.5
 
@@ -123,6 +124,11 @@ class StepGraphs:
         model.watch(graph.outputs, losses, batch)
         return dict(graph.outputs), dict(losses)
 
+    def picture(self, view: Cameras, step: int) -> Tensor | None:
+        """A view between cameras, drawn as a photograph (`NrfgsModel.picture`); None where no graph can draw it."""
+        batch = {"image": torch.empty(int(view.height), int(view.width), 0), "between": True}
+        return self._graphs[_kind(batch)].run() if self.prepare(view, batch, step) else None
+
     def _drop_if_outdated(self) -> bool:
         """Drop all graphs, and return True, where the step differs from the recorded ones in its splats, its resolution
         or the phase of head or densification."""
@@ -148,7 +154,7 @@ class StepGraphs:
         self._recorded, self._settings = objects, settings
         return True
 
-    def _record(self, kind: tuple, pinhole: Pinhole, batch: Mapping[str, Any], index: int, step: int) -> None:
+    def _record(self, kind: _Kind, pinhole: Pinhole, batch: Mapping[str, Any], index: int, step: int) -> None:
         """Record a graph for this kind of photograph and prepare it for a step; if that fails, record none from now
         on."""
         self._update_pairs()
@@ -159,7 +165,8 @@ class StepGraphs:
             room = int(MORE_ROOM * self._pairs_per_splat * self.model.num_points) + 1
             if not self._graphs:  # a pool's memory is free for others when all its graphs are gone
                 self._pool_and_stream = torch.cuda.graph_pool_handle(), torch.cuda.Stream(self.model.device)
-            graph = self._graphs[kind] = _StepGraph(self.model, pinhole, batch, room, *self._pool_and_stream)
+            make = _PictureGraph if kind.sort == "picture" else _StepGraph
+            graph = self._graphs[kind] = make(self.model, pinhole, batch, room, *self._pool_and_stream)
             graph.prepare(pinhole, batch, index, step)
         except Exception as error:
             self._given_up = True
@@ -193,9 +200,19 @@ class StepGraphs:
         return most
 
 
-def _kind(batch: Mapping[str, Any]) -> tuple:
+class _Kind(NamedTuple):
     """The properties of a photograph for which its graph is recorded."""
-    return tuple(batch["image"].shape), "mask" in batch, "between" in batch
+
+    shape: tuple[int, ...]
+    has_mask: bool
+    sort: Literal["photograph", "between", "picture"]
+    """of a training camera; of a view between cameras; not there yet, but to be drawn (shape [H, W, 0])"""
+
+
+def _kind(batch: Mapping[str, Any]) -> _Kind:
+    shape = tuple(batch["image"].shape)
+    sort = "photograph" if "between" not in batch else "between" if shape[-1] else "picture"
+    return _Kind(shape, "mask" in batch, sort)
 
 
 class _StepGraph:
@@ -274,14 +291,11 @@ class _StepGraph:
         splats = {name: leaves[f"splats.{name}"] for name in model.gauss_params}
         weights = {name: leaves[f"head.{name}"] for name, _ in model.head.named_parameters()}
         head = lambda *view: functional_call(model.head, weights, view)  # noqa: E731
-        shot = look = None
-        if self.shot is not None:
-            shot = self.shot.detach().requires_grad_()
-            look = lambda rgb: functional_call(model.photograph, {"shots": shot}, (rgb, 0))  # noqa: E731
+        shot = None if self.shot is None else self.shot.detach().requires_grad_()
         with torch.enable_grad(), self.room.in_use():
-            view = project_view(splats, self.pinhole, replace(model.projection_options, every_row=True))
+            view = self._project(splats)
             noisy = Field(head, model.view_noise.moved(splats, self.noise))
-            outputs, info = model.render_view(view, noisy, look, self.is_between)
+            outputs, info = model.render_view(view, noisy, self._look(shot), self.is_between)
             losses = loss_of(model, splats, outputs, self.batch, self.is_between)
             sum(losses.values()).backward()
         self.gradients = {name: leaf.grad for name, leaf in leaves.items()}
@@ -294,6 +308,14 @@ class _StepGraph:
             gradient = getattr(info["means2d"], name, None)
             if gradient is not None:
                 setattr(self.info["means2d"], name, gradient)
+
+    def _project(self, splats: Mapping[str, Tensor]) -> View:
+        return project_view(splats, self.pinhole, replace(self.model.projection_options, every_row=True))
+
+    def _look(self, shot: Tensor | None) -> Callable[[Tensor], Tensor] | None:
+        """The exposure model with a row of `shots` in place of all."""
+        model = self.model.photograph
+        return None if shot is None else lambda rgb: functional_call(model, {"shots": shot}, (rgb, 0))
 
     def had_room(self) -> bool:
         """Whether the step before had room for all pairs."""
@@ -319,13 +341,30 @@ class _StepGraph:
 
     def run(self) -> dict[str, Tensor]:
         """Compute a step: returns its losses, sets the parameters' gradients, `outputs` and `info`."""
-        self.graph.replay()
+        self._replay()
         if self.shot is not None:
             shots = self.parameters["photograph.shots"] = self.model.photograph.shots
             self.gradients["photograph.shots"] = torch.zeros_like(shots)
             self.gradients["photograph.shots"][self.index] = self.shot_gradient[0]
-        self._counted.copy_(self.room.counted, non_blocking=True)
-        self._arrived.record()
         for name, parameter in self.parameters.items():
             parameter.grad = self.gradients[name]
         return self.losses
+
+    def _replay(self) -> None:
+        self.graph.replay()
+        self._counted.copy_(self.room.counted, non_blocking=True)
+        self._arrived.record()
+
+
+class _PictureGraph(_StepGraph):
+    """A view drawn as a photograph, without loss and gradients."""
+
+    def _compute(self) -> None:
+        field = self.model.field
+        with torch.no_grad(), self.room.in_use():
+            self.picture = self.model.picture(self._project(field.splats), field, self._look(self.shot))
+
+    def run(self) -> Tensor:
+        """Draw it: returns a copy, since the next graph overwrites it."""
+        self._replay()
+        return self.picture.clone()

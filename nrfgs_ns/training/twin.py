@@ -123,7 +123,7 @@ class Twin:
         pulls: list[Gradients] = [{}, {}]
         if step % self.every == 0 and first.schedule_step >= START and first._get_downscale_factor() == 1:
             view = self.between.draw(Random(f"{first._seed} {step}"))
-            pictures = picture(model, view), picture(first, view)
+            pictures = [picture(each, view, step) for each in (self, self.trainer)]
             pulls = [pull(each, view, seen, step) for each, seen in zip((self.trainer, self), pictures, strict=True)]
         for name, optimizer in self.optimizers.optimizers.items():
             optimizer.param_groups[0]["lr"] = self.trainer.optimizers.optimizers[name].param_groups[0]["lr"]
@@ -182,7 +182,7 @@ def descend(training, step: int, pulled: Gradients, with_metrics: bool = False) 
 
 
 def pull(training, view: Cameras, seen: Tensor, step: int) -> Gradients:
-    """Gradients of the photometric loss of a view against another model's picture of it (`picture`)."""
+    """Gradients of the photometric loss of a view against the other model's picture of it (`picture`)."""
     model, optimizers = training.pipeline.model, training.optimizers
     batch = {"image": seen, "image_idx": view.metadata["cam_idx"], "between": True}
     if training.graphs.prepare(view, batch, step):
@@ -196,15 +196,12 @@ def pull(training, view: Cameras, seen: Tensor, step: int) -> Gradients:
     return {parameter: parameter.grad.clone() for parameter in parameters if parameter.grad is not None}
 
 
-@torch.no_grad()
-def picture(model, view: Cameras) -> Tensor:
-    """A model's rendering as a photograph, uint8 [H, W, 4], transparent where nothing is drawn; [H, W, 3] over black
-    where photographs' exposures are learnt, which are not of transparent ones."""
-    field = model.field
-    projected = model.project(view, field.splats)
-    look = model.look_of(view.metadata["cam_idx"])
-    outputs, _ = model.composite(projected, field.seen_from(projected), torch.zeros(3, device=model.device), look)
-    rgb, alpha = outputs["rgb"], outputs["accumulation"]
-    if model.photograph is None:
-        rgb = torch.cat([rgb / alpha.clamp_min(1e-6), alpha], dim=-1)
-    return (255 * rgb).round().clamp(0, 255).byte()
+def picture(training, view: Cameras, step: int) -> Tensor:
+    """A model's picture of a view (`NrfgsModel.picture`), recorded where steps are."""
+    recorded = training.graphs.picture(view, step)
+    if recorded is not None:
+        return recorded
+    model = training.pipeline.model
+    with torch.no_grad():
+        field = model.field
+        return model.picture(model.project(view, field.splats), field, model.look_of(view.metadata["cam_idx"]))

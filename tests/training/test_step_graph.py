@@ -13,7 +13,7 @@ from nrfgs_lab.training_run import evaluate
 from nrfgs_ns.densification import STRATEGIES, UNSEEN, memory
 from nrfgs_ns.kernels import trial
 from nrfgs_ns.training import step_graph
-from nrfgs_ns.training.step_graph import MOST_SIZES, StepGraphs
+from nrfgs_ns.training.step_graph import MOST_SIZES, StepGraphs, _Kind
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def build(tiny_scene, tmp_path):
 def test_a_photograph_of_one_size_too_many_has_no_graph_and_it_is_said(build, monkeypatch):
     pipeline, graphs = build("cpu")
     assert graphs._obstacle({"image": torch.zeros(5, 4, 3)}) is None
-    graphs._graphs = {((height, 4, 3), False, False): None for height in range(5, 5 + MOST_SIZES)}
+    graphs._graphs = {_Kind((height, 4, 3), False, "photograph"): None for height in range(5, 5 + MOST_SIZES)}
     assert graphs._obstacle({"image": torch.zeros(5, 4, 3)}) is None
     assert "many sizes" in graphs._obstacle({"image": torch.zeros(4, 4, 3)})
     assert graphs._obstacle({"image": torch.zeros(4, 4, 3), "between": True}) is None  # a twin's picture
@@ -116,7 +116,7 @@ def test_graphs_of_replaced_splats_are_freed_while_steps_are_not_recorded(build,
     model, batch = pipeline.model, pipeline.datamanager.train_view(0)[1]
     monkeypatch.setattr(type(model), "device", torch.device("cuda"))
     graphs._drop_if_outdated()
-    graphs._graphs = {((9, 9, 3), False, False): SimpleNamespace(most_pairs=lambda: 2, count=1)}
+    graphs._graphs = {_Kind((9, 9, 3), False, "photograph"): SimpleNamespace(most_pairs=lambda: 2, count=1)}
     model.step = 499
     assert graphs._can_record(batch) and graphs._graphs
     model.step = 500

@@ -95,14 +95,13 @@ def test_views_lie_between_neighbouring_cameras(tiny_scene, tmp_path, no_cuda, m
 def test_with_exposures_pictures_and_what_learns_from_them_are_over_black(tiny_scene, tmp_path, no_cuda):
     trainer = ready(tiny_scene, tmp_path, {"--pipeline.model.photographs": "on", "--pipeline.model.view-noise": 0})
     model, view = trainer.pipeline.model, trainer.twin.between.draw(Random(0))
-    assert_close(picture(model, view) / 255, model.get_outputs(view)["rgb"], rtol=0, atol=0.5001 / 255)
+    assert_close(picture(trainer, view, 0) / 255, model.get_outputs(view)["rgb"], rtol=0, atol=0.5001 / 255)
 
 
 def test_a_pull_is_the_gradient_of_the_loss_against_the_others_picture(tiny_scene, tmp_path, no_cuda):
     trainer = ready(tiny_scene, tmp_path)
-    model, other = trainer.pipeline.model, trainer.twin.pipeline.model
-    view = trainer.twin.between.draw(Random(0))
-    seen = picture(other, view)
+    model, view = trainer.pipeline.model, trainer.twin.between.draw(Random(0))
+    seen = picture(trainer.twin, view, 4)
     assert seen.dtype == torch.uint8 and seen.shape[-1] == 4
     model.view_noise.sigma, model.background_color = 0.0, torch.zeros(3)
     model.config.background_color = "black"
@@ -132,7 +131,7 @@ def test_densification_looks_at_photographs_alone(tiny_scene, tmp_path, no_cuda)
     for pulls in (False, True):
         pipeline.datamanager.train_unseen_cameras = [0]
         view = trainer.twin.between.draw(Random(0))
-        more = pull(trainer, view, picture(trainer.twin.pipeline.model, view), 0) if pulls else {}
+        more = pull(trainer, view, picture(trainer.twin, view, 0), 0) if pulls else {}
         torch.manual_seed(1)
         descend(trainer, 0, more)
         info, remembered = model.info, model.trimming.histogram.clone()
@@ -144,20 +143,29 @@ def test_densification_looks_at_photographs_alone(tiny_scene, tmp_path, no_cuda)
 
 
 @pytest.mark.gpu
-def test_a_pull_is_the_same_recorded(tiny_scene, tmp_path):
-    trainer = ready(tiny_scene, tmp_path, {"--pipeline.model.appearance.precision": "fp32"})
-    model = trainer.pipeline.model
-    results = []
+@pytest.mark.parametrize("photographs", ["off", "on"])
+def test_pictures_and_pulls_are_the_same_recorded(photographs, tiny_scene, tmp_path):
+    options = {"--pipeline.model.appearance.precision": "fp32", "--pipeline.model.photographs": photographs}
+    trainer = ready(tiny_scene, tmp_path, options)
+    model, twin = trainer.pipeline.model, trainer.twin
+    if model.photograph is not None:
+        for each in (model, twin.pipeline.model):
+            each.photograph.shots.data.normal_(0.0, 0.1)
+    pictures, pulls = [], []
     for attempt in range(4):  # the first is eager, the second recorded, the third a replay
-        trainer.graphs._given_up = attempt == 3
-        model.step_cb(trainer.optimizers, 20)
-        view = trainer.twin.between.draw(Random(0))
-        seen = picture(trainer.twin.pipeline.model, view)
+        trainer.graphs._given_up = twin.graphs._given_up = attempt == 3
+        for each, optimizers in ((model, trainer.optimizers), (twin.pipeline.model, twin.optimizers)):
+            each.step_cb(optimizers, 20)
+        view = twin.between.draw(Random(0))
+        pictures.append(picture(twin, view, 20))
+        picture(trainer, twin.between.draw(Random(1)), 20)
         torch.manual_seed(7)
-        results.append(pull(trainer, view, seen, 20))
-    assert len(trainer.graphs._graphs) == 1
+        pulls.append(pull(trainer, view, pictures[0], 20))
+    assert [len(each.graphs._graphs) for each in (trainer, twin)] == [2, 1]
+    for other in pictures[:3]:  # a rounding moves few pixels to the next level
+        assert (other.int() - pictures[3].int()).abs().max() <= 1 and (other != pictures[3]).float().mean() < 1e-3
     for name, parameter in model.named_parameters():
-        if parameter in results[3]:
-            expected = results[3][parameter]
-            for other in results[:3]:
+        if parameter in pulls[3]:
+            expected = pulls[3][parameter]
+            for other in pulls[:3]:
                 assert (other[parameter] - expected).norm() <= 1e-4 * expected.norm() + 1e-9, name
