@@ -7,9 +7,9 @@ between two training cameras, with the other model's picture of that view as the
 the training to go on; commands read the first.
 """
 
+import functools
 import math
 from copy import copy, deepcopy
-from functools import reduce
 from random import Random
 from typing import Any
 
@@ -57,23 +57,26 @@ class Between:
 
     def __init__(self, cameras: Cameras):
         self.cameras = cameras
+        self.views = [cameras[index : index + 1] for index in range(len(cameras))]
+        self.poses = cameras.camera_to_worlds.double().numpy()
         centers, backward = cameras.camera_to_worlds[..., 3], cameras.camera_to_worlds[..., 2]
         self.spacing = camera_spacing(centers)
         places = torch.cat([centers / max(self.spacing, 1e-12), TURN * backward], dim=1)
         distances = torch.cdist(places, places, compute_mode="donot_use_mm_for_euclid_dist").fill_diagonal_(math.inf)
         count = max(min(NEIGHBOURS, len(cameras) - 1), 1)
         self.neighbours = distances.topk(count, largest=False).indices.tolist()
+        self._turn = functools.cache(lambda *pair: Slerp([0, 1], Rotation.from_matrix(self.poses[[*pair], :, :3])))
 
     def draw(self, random: Random) -> Cameras:
         """A view between a camera and one of its neighbours, with the first one's lens. [1], in host memory."""
-        index = random.randrange(len(self.cameras))
-        pair = self.cameras.camera_to_worlds[[index, random.choice(self.neighbours[index])]].double().numpy()
+        index = random.randrange(len(self.views))
+        other = random.choice(self.neighbours[index])
         share = random.random()
         jitter = [random.gauss(0.0, JITTER * self.spacing) for _ in range(3)]
-        center = (1 - share) * pair[0, :, 3] + share * pair[1, :, 3] + jitter
-        rotation = Slerp([0, 1], Rotation.from_matrix(pair[:, :, :3]))(share).as_matrix()
-        view = self.cameras[index : index + 1]
-        view.camera_to_worlds = torch.from_numpy(np.column_stack([rotation, center])[None]).float()
+        center = (1 - share) * self.poses[index, :, 3] + share * self.poses[other, :, 3] + jitter
+        view = copy(self.views[index])
+        pose = np.column_stack([self._turn(index, other)(share).as_matrix(), center])
+        view.camera_to_worlds = torch.from_numpy(pose[None]).float()
         view.metadata = {"cam_idx": index, "between": True}
         return view
 
@@ -171,7 +174,7 @@ def descend(training, step: int, pulled: Gradients, with_metrics: bool = False) 
     training.guard.begin(step, optimizers, settled_later=training.graphs is not None)
     optimizers.zero_grad_all()
     _, losses, metrics = training.pipeline.get_train_loss_dict(step, training.graphs, with_metrics)
-    loss = reduce(torch.add, losses.values())
+    loss = functools.reduce(torch.add, losses.values())
     if loss.requires_grad:  # a recorded step has made its gradients already
         loss.backward(torch.full_like(loss, 1.0 / training.world_size))  # the mean of the devices' losses
     for parameter, gradient in pulled.items():
