@@ -106,9 +106,13 @@ def test_it_trains_under_the_name_that_the_page_gives_it(tiny_scene, tmp_path, m
     (code,) = re.findall(r"```python\n(# my_head\.py\n.*?)```", PAGES["docs/contributing.md"], re.DOTALL)
     (tmp_path / "my_head.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setenv("NERFSTUDIO_METHOD_CONFIGS", "linear=my_head:linear")
+    monkeypatch.setenv("NERFSTUDIO_METHOD_CONFIGS", "linear=my_head:linear,linear-suited=my_head:suited")
     configs, descriptions = discover_methods()
     assert descriptions["linear"] == "Colours that are linear in the view direction."
+    suited, ours = (
+        dataclasses.replace(one.pipeline.model, appearance=None) for one in (configs["linear-suited"], configs["nrfgs"])
+    )
+    assert suited == ours and configs["linear-suited"].max_num_iterations == 0
     # nerfstudio looks for methods when it is first imported; here it was imported long ago.
     monkeypatch.setitem(eval_utils.all_methods, "linear", configs["linear"])
     monkeypatch.setattr(method_configs, "AnnotatedBaseConfigUnion", tyro.extras.subcommand_type_from_defaults(configs))
