@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from statistics import fmean, median, stdev
 
 from nrfgs_lab.bench.spec import OWN
-from nrfgs_lab.pages.few_views import FIELD, SAME, today
+from nrfgs_lab.pages.few_views import FIELD, SAME, alone, today
 from nrfgs_lab.pages.runs import ORIGINAL, VIEWS, Trainings, grid, mean, records, signed
 from nrfgs_lab.pages.speed import RENDERERS, scale_cells
 
@@ -37,18 +37,18 @@ def default() -> str:
 
 def _metrics(runs: Trainings) -> list[str]:
     """Means over trainings, and the worst view of all."""
-    cells = [f"{mean(runs, metric):.3f}" for metric in ("ssim", "flip")]
+    flip = "-" if any(one["flip"] is None for one in runs) else f"{mean(runs, 'flip'):.3f}"
     middle = fmean(median(view[1] for view in one["per_image"]) for one in runs)
     worst = min(view[1] for one in runs for view in one["per_image"])
-    return [*cells, f"{middle:.1f}", f"{worst:.1f}", f"{mean(runs, 'splats') / 1000:.0f}k"]
+    return [f"{mean(runs, 'ssim'):.3f}", flip, f"{middle:.1f}", f"{worst:.1f}", f"{mean(runs, 'splats') / 1000:.0f}k"]
 
 
 def rivals() -> str:
-    """Each densification on test views: the field's mean PSNR, that of the median view, SSIM; harmonics' mean PSNR."""
+    """Each densification without a twin on test views: PSNR (mean, median view) and SSIM; harmonics' mean PSNR."""
     rules, body = (OWN, *RIVALS.values()), []
     for scene in VIEWS:
-        field = [(mean(runs, "psnr"), _metrics(runs)) for runs in (today(scene, FIELD, rule) for rule in rules)]
-        harmonics = "/".join(f"{mean(today(scene, SAME, rule), 'psnr'):.2f}" for rule in rules)
+        field = [(mean(runs, "psnr"), _metrics(runs)) for runs in (alone(scene, FIELD, rule) for rule in rules)]
+        harmonics = "/".join(f"{mean(alone(scene, SAME, rule), 'psnr'):.2f}" for rule in rules)
         body.append([scene, *(f"{psnr:.2f}/{cells[2]}/{cells[0]}" for psnr, cells in field), harmonics])
     return grid(["", "`nrfgs`", *RIVALS, "harmonics, these four"], body)
 

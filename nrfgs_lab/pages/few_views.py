@@ -8,10 +8,11 @@ from statistics import fmean, median, stdev
 from scipy.stats import binomtest
 
 from nrfgs_lab.bench.spec import OWN
-from nrfgs_lab.pages.runs import VIEWS, Trainings, bench_rows, grid, mean, records, signed, span, trainings, view_gains
+from nrfgs_lab.pages.runs import VIEWS, Trainings, bench_rows, grid, mean, records, signed, trainings, view_gains
 
 FIELD, HOST, SAME = "nrfgs", "splatfacto", "harmonics, same rules"
 FEW = list(VIEWS)[1:]
+TWINS = [scene for scene, views in VIEWS.items() if views <= 50]
 SPARSE = {"24_views_bonsai": (24, "22.60"), "kitchen": (21, "19.24 (other views)")}
 """Scene of results/twenty-four.json -> training views, and others' PSNR of 3DGS at an eighth (arXiv 2508.04968)."""
 HALF = {f"{views}_views_bonsai": views for views in (16, 24, 32, 64, 128)} | {"bonsai": 255}
@@ -26,16 +27,22 @@ def host(scene: str) -> Trainings:
     return (first or trainings("presets", scene, "nerfstudio_splatfacto", OWN)) + today(scene, HOST)
 
 
-def today(scene: str, name: str, strategy: str = OWN) -> Trainings:
+def alone(scene: str, name: str, strategy: str = OWN) -> Trainings:
     """The trainings of a capture with today's settings, without a twin, by seed."""
     return trainings("default", scene, name.replace(",", "_").replace(" ", "_"), strategy)
 
 
+def today(scene: str, name: str, strategy: str = OWN) -> Trainings:
+    """The same as they are by default: with a twin where views are few."""
+    return alone(scene, f"{name}, twin" if scene in TWINS and name in (FIELD, SAME) else name, strategy)
+
+
 def twins(trial: str, base: str) -> list[list[dict]]:
-    """Pairs of records of a trial with a twin and of one without, on the same held-out views."""
+    """Pairs of records of a trial with a twin and of one without, of the same seed, on the same held-out views."""
     rows = bench_rows("twin")
-    places = [place for place in rows if place[2] == trial and (*place[:2], base) in rows]
-    return [[next(iter(rows[(*place[:2], run)].records.values())) for run in (trial, base)] for place in places]
+    others = {place: rows.get((*place[:2], base)) for place in rows if place[2] == trial}
+    pairs = [(rows[place].records, other.records) for place, other in others.items() if other]
+    return [[one[seed], other[seed]] for one, other in pairs for seed in one if seed in other]
 
 
 def twin_gain(trial: str, base: str) -> str:
@@ -51,10 +58,27 @@ def twin_gain(trial: str, base: str) -> str:
     return f"{gain} (better on {better}), {signed(fmean(worst), 1)} dB in the worst view"
 
 
+def twin_tests(kind: str) -> str:
+    """Changes by a twin on test views: PSNR and SSIM in the mean over seeds, and the seeds that gain PSNR."""
+    cells = []
+    for scene in TWINS:
+        both = [of(scene, FIELD if kind == "field" else SAME) for of in (today, alone)]
+        psnr, ssim = (mean(both[0], metric) - mean(both[1], metric) for metric in ("psnr", "ssim"))
+        better = sum(one["psnr"] > other["psnr"] for one, other in zip(*both, strict=True))
+        cells.append(f"`{scene}` {signed(psnr, 2)} dB, {signed(ssim, 4)} SSIM ({better}/{len(both[0])})")
+    return "; ".join(cells)
+
+
+def twin_spread(scene: str) -> str:
+    """Difference between the best and the worst seed of the field on test views, with a twin and without."""
+    values = [[one["psnr"] for one in of(scene, FIELD)] for of in (today, alone)]
+    return "{:.1f} instead of {:.1f} dB".format(*(max(seeds) - min(seeds) for seeds in values))
+
+
 def twin_cost(of: str) -> str:
-    """Least and most by which a twin multiplies a training's seconds or peak memory, of pairs in one sitting."""
+    """What a twin multiplies a training's seconds or peak memory by, in the median of pairs of one sitting each."""
     pairs = [*twins("twin", "alone"), *twins("harmonics", "harmonics_alone")]
-    return span([one["train"][of] / other["train"][of] for one, other in pairs], "{:.1f}".format)
+    return f"{median(one['train'][of] / other['train'][of] for one, other in pairs):.1f}"
 
 
 def ahead(gains: list[float], digits: int = 1) -> str:
@@ -178,6 +202,8 @@ BLOCKS = {
     "readme.demo": demo,
     "captures.rules_gain": rules_gain,
     "captures.twin": twin_gain,
+    "captures.twin_tests": twin_tests,
+    "captures.twin_spread": twin_spread,
     "captures.twin_cost": twin_cost,
     "captures.floaters": floaters,
     "captures.today": lambda *place: _run({of: mean(today(*place), of) for of in ("psnr", "ssim", "splats")}),

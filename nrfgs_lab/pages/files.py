@@ -3,7 +3,7 @@
 
 from typing import Any
 
-from nrfgs_lab.pages.few_views import SAME, today
+from nrfgs_lab.pages.few_views import SAME, alone
 from nrfgs_lab.pages.runs import grid, mean, records
 
 CAPTURES = "bonsai", "goldcape", "fox"
@@ -29,7 +29,7 @@ def losses() -> str:
     body = []
     for scene, one in plies().items():
         cost = f"{one['splats']:,}", f"{one['bytes'] / 1e6:.1f}"
-        psnr = *(one[f"psnr_{part}"] for part in ("model", "file", "on_screen")), mean(today(scene, SAME), "psnr")
+        psnr = *(one[f"psnr_{part}"] for part in ("model", "file", "on_screen")), mean(alone(scene, SAME), "psnr")
         body.append([scene, *cost, *map("{:.2f}".format, psnr)])
     return grid(["", "splats", "MB", "model", "file", "in Spark", "harmonics, trained"], body)
 
