@@ -12,6 +12,7 @@ import sys
 import warnings
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
+from pathlib import Path
 
 import tyro
 
@@ -27,15 +28,10 @@ def commands() -> dict[str, EntryPoint]:
 
 
 def summary(command: EntryPoint) -> str:
-    """The first sentence of a command's docstring, read from its source; "" without one."""
-    spec = find_spec(command.module)
-    if spec is None or spec.origin is None:
-        return ""
-    with open(spec.origin, encoding="utf-8") as file:
-        tree = ast.parse(file.read())
+    """The first sentence of a command's docstring, read from its source."""
+    tree = ast.parse(Path(find_spec(command.module).origin).read_text(encoding="utf-8"))
     classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
-    text = ast.get_docstring(classes[command.attr]) if command.attr in classes else None
-    return " ".join((text or "").split()).split(". ")[0].removesuffix(".")
+    return " ".join(ast.get_docstring(classes[command.attr]).split()).split(". ")[0].removesuffix(".")
 
 
 def listing() -> str:

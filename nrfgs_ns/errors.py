@@ -5,7 +5,7 @@ import os
 import sys
 
 DEBUG = os.environ.get("NRFGS_DEBUG", "0") not in ("", "0")
-"""NRFGS_DEBUG=1: such exceptions show their traceback, and ns-train its whole configuration."""
+"""NRFGS_DEBUG=1: such exceptions show their traceback."""
 
 
 class ForTheUser(Exception if DEBUG else SystemExit):

@@ -34,15 +34,12 @@ from nrfgs_ns.viewer.server import LocalViewerConfig
 
 with_methods()
 
-HALF_A_SPACING = 0.5
-"""Noise on where a head is asked from, in distances between neighbouring training cameras (docs/captures.md)."""
-
 SUITED = {
     "densification": ErrorGuided(),
     "dense_start": "auto",
     "twin": "auto",
     "near_plane": "auto",
-    "view_noise": HALF_A_SPACING,
+    "view_noise": 0.5,  # distances between neighbouring training cameras
     "shrinkage": 3.0,  # halved with every 12 training views
 }
 """The model's options that suit a training to its capture, whatever the head."""

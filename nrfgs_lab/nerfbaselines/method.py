@@ -38,7 +38,7 @@ from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.data.views import different_views
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.model.model import NrfgsModel
-from nrfgs_ns.training.checkpoint_files import read_or_refuse
+from nrfgs_ns.training.checkpoint_files import read
 from nrfgs_ns.training.config_file import read_config
 from nrfgs_ns.training.identity import leaves
 from nrfgs_ns.training.trainer import NrfgsTrainer
@@ -81,7 +81,7 @@ class Nrfgs:
             self.record = json.loads((self.checkpoint / "world.json").read_text(encoding="utf-8"))
             self.world = World(torch.tensor(self.record["transform"], dtype=torch.float64), self.record["scale"])
         if train_dataset is None:
-            content = read_or_refuse(self.file)
+            content = read(self.file)
             self.model = _build_model(copy.deepcopy(self.config), self.record, content)
             self.step = content["step"] + 1
         else:

@@ -43,14 +43,7 @@ def swap_counts(counts: Tensor) -> tuple[list[int], list[int]]:
     return tuple(torch.stack([counts, received]).tolist())
 
 
-def gather_counts(count: int, device: torch.device) -> list[int]:
-    """Every device's count, [W]."""
-    counts = torch.empty(world(), dtype=torch.int64, device=device)
-    dist.all_gather_into_tensor(counts, torch.tensor([count], device=device))
-    return counts.tolist()
-
-
-def gather_objects(value: Any) -> list[Any]:
+def gather(value: Any) -> list[Any]:
     """Every device's value, [W]: plain numbers, strings, lists, dicts and CPU tensors."""
     values = [None] * world()
     dist.all_gather_object(values, value)

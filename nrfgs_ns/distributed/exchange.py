@@ -16,9 +16,6 @@ from nrfgs_ns.appearance.head import SplatAppearance
 from nrfgs_ns.distributed import comm
 from nrfgs_ns.rasterizer import Projection
 
-COLUMNS = {"means2d": 2, "conics": 3, "depths": 1, "opacities": 1, "radii": 1}
-"""Columns of a row, in this order, before its colour. Radii travel as floating point, exact up to 2^24 pixels."""
-
 
 @dataclass
 class AbsgradPost:
@@ -71,18 +68,13 @@ def send_to_cameras(
     opacities = appearance.opacities
     if projection.compensations is not None:
         opacities = opacities * projection.compensations
-    dtype = projection.means2d.dtype
-    columns = [
-        projection.means2d,
-        projection.conics,
-        projection.depths[:, None],
-        opacities.to(dtype)[:, None],
-        projection.radii.to(dtype)[:, None],
-        appearance.colors.to(dtype),
-    ]
+    # Radii travel as floating point, exact up to 2^24 pixels.
+    scalars = [column[:, None] for column in (projection.depths, opacities, projection.radii)]
+    columns = [projection.means2d, projection.conics, *scalars, appearance.colors]
+    columns = [column.to(projection.means2d.dtype) for column in columns]
     post = AbsgradPost(projection.means2d) if absgrad else None
     rows = _Swap.apply(torch.cat(columns, dim=1), sent, received, post)
-    means2d, conics, depths, opacities, radii, colors = rows.split([*COLUMNS.values(), columns[-1].shape[1]], dim=1)
+    means2d, conics, depths, opacities, radii, colors = rows.split([column.shape[1] for column in columns], dim=1)
     means2d = means2d.contiguous()  # the kernels would make a copy, and leave absgrad with it
     if post is not None:
         post.arrived = means2d

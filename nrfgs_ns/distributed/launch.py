@@ -17,11 +17,7 @@ from nrfgs_ns.training.stopping import SIGNALS
 
 
 def prepare(config: TrainerConfig) -> None:
-    """Check the devices; `ns-train` calls this before it starts the processes.
-
-    Raises:
-        InputError: the devices are CPUs, or this machine has fewer GPUs than the training asks for.
-    """
+    """Raise InputError where `ns-train` cannot start the processes: on CPUs, or on fewer GPUs than are asked for."""
     if config.machine.device_type == "cpu":
         raise InputError("ns-train starts several processes on GPUs alone. On CPUs: python -m nrfgs_lab.many_processes")
     wanted = config.machine.num_devices

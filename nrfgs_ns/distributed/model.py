@@ -13,7 +13,7 @@ from nrfgs_ns.appearance.head import ViewNoise
 from nrfgs_ns.densification import Densification
 from nrfgs_ns.distributed import comm
 from nrfgs_ns.distributed.exchange import send_to_cameras
-from nrfgs_ns.distributed.shards import map_model_rows, rebalance, rows_of, shard_counts
+from nrfgs_ns.distributed.shards import map_model_rows, own_rows, rebalance, shard_counts
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.photograph import PhotographModel
 from nrfgs_ns.model.loss import shrinkage
@@ -35,8 +35,6 @@ class ShardedModel(NrfgsModel):
     warms_up = False
     counts: list[int]
     """every device's splats, [W]"""
-    loaded: slice | None = None
-    """this device's rows of the checkpoint, once one has been loaded"""
 
     def populate_modules(self):
         self.sharding: ShardingConfig = self.kwargs["sharding"]
@@ -49,23 +47,21 @@ class ShardedModel(NrfgsModel):
         config = self.config.densification.share_of(comm.rank(), comm.world())
         strategy = config.build(self.num_train_data, self.num_views, self.scene_unit)
         strategy.verbose = comm.rank() == 0
-        strategy.minimum_of_devices = lambda number: min(comm.gather_counts(number, self.device))
+        strategy.minimum_of_devices = lambda number: min(comm.gather(number))
         return strategy
 
     def _initial_splats(self) -> dict[str, Tensor]:
         whole = super()._initial_splats()
-        total = len(whole["means"])
-        self.counts = shard_counts(total, comm.world())
-        rows = rows_of(comm.rank(), total, comm.world())
-        return {name: value[rows].clone() for name, value in whole.items()}
+        self.counts = shard_counts(len(whole["means"]), comm.world())
+        return {name: own_rows(value).clone() for name, value in whole.items()}
 
     def start_from(self, seed_points: tuple[Tensor, Tensor]) -> None:
         """Start from the main device's points: others may round differently."""
-        super().start_from(comm.gather_objects(tuple(table.cpu() for table in seed_points))[0])
+        super().start_from(comm.gather(tuple(table.cpu() for table in seed_points))[0])
 
     def learn_photographs(self, photographs: PhotographModel | None) -> None:
         """Learn each photograph's exposure, starting from the main device's: others may round differently."""
-        states = comm.gather_objects(None if photographs is None else photographs.state_dict())
+        states = comm.gather(None if photographs is None else photographs.state_dict())
         super().learn_photographs(None if states[0] is None else PhotographModel.from_state(states[0]))
 
     @property
@@ -144,7 +140,7 @@ class ShardedModel(NrfgsModel):
 
     def count(self) -> None:
         """Update `counts` from all devices."""
-        self.counts = comm.gather_counts(self.num_points, self.device)
+        self.counts = comm.gather(self.num_points)
 
     @torch.no_grad()
     def _screen_info(self) -> dict[str, Any]:
@@ -181,8 +177,5 @@ class ShardedModel(NrfgsModel):
 
     def load_state_dict(self, state: dict[str, Any], strict: bool = True, **kwargs):
         """Load this device's rows of a whole checkpoint. See `NrfgsModel.load_state_dict`."""
-        total = len(state["gauss_params.means"])
-        devices = comm.world()
-        self.loaded = rows_of(comm.rank(), total, devices)
-        self.counts = shard_counts(total, devices)
-        return super().load_state_dict(map_model_rows(state, lambda table: table[self.loaded]), strict=strict, **kwargs)
+        self.counts = shard_counts(len(state["gauss_params.means"]), comm.world())
+        return super().load_state_dict(map_model_rows(state, own_rows), strict=strict, **kwargs)

@@ -17,24 +17,21 @@ from torch.optim import Optimizer
 from nrfgs_ns.densification.strategy import per_splat_state
 from nrfgs_ns.distributed import comm
 
-PREFIX = "gauss_params."
-"""Prefix of the splats' tensors in a model's state"""
-
 
 def shard_counts(total: int, devices: int) -> list[int]:
     """Rows of each device's shard, [W], when `total` rows are dealt out in turn."""
     return [len(range(rank, total, devices)) for rank in range(devices)]
 
 
-def rows_of(rank: int, total: int, devices: int) -> slice:
-    """Which rows of a whole table are a device's. They are dealt out in turn, because neighbours in a point cloud are
+def own_rows(table: Tensor) -> Tensor:
+    """This device's rows of a whole table. They are dealt out in turn, because neighbours in a point cloud are
     neighbours in space, and each camera should see equally many splats of each device."""
-    return slice(rank, total, devices)
+    return table[comm.rank() :: comm.world()]
 
 
 def map_model_rows(state: Mapping[str, Any], change: Callable[[Tensor], Any], prefix: str = "") -> dict[str, Any]:
     """A model's state, named after `prefix`, with each table of splats and of densification's statistics changed."""
-    rows = f"{prefix}{PREFIX}"
+    rows = f"{prefix}gauss_params."
     extra = state[f"{prefix}_extra_state"]
     statistics = per_splat_state(extra["strategy"], len(state[f"{rows}means"]))
     strategy = {**extra["strategy"], **{name: change(value) for name, value in statistics.items()}}

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -20,7 +19,7 @@ from torch.optim import Optimizer
 
 from nrfgs_ns.distributed import comm
 from nrfgs_ns.distributed.model import ShardedModel
-from nrfgs_ns.distributed.shards import map_model_rows, map_moments
+from nrfgs_ns.distributed.shards import map_model_rows, map_moments, own_rows
 from nrfgs_ns.training.averaging import ParameterMean
 from nrfgs_ns.training.guard import MAX_GRADIENT, Guard, TrainingStopped, Verdict, Watched
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
@@ -28,11 +27,6 @@ from nrfgs_ns.training.pipeline import NrfgsPipeline, NrfgsPipelineConfig
 from nrfgs_ns.training.stopping import StopRequest
 from nrfgs_ns.training.trainer import NrfgsTrainer
 from nrfgs_ns.training.trainer_config import NrfgsTrainerConfig
-
-ELSEWHERE = "a number on another device"
-ASKED = "a signal"
-WITHOUT_VIEWER = {"viewer": "tensorboard", "viewer_legacy": "tensorboard"}
-"""What `--vis` becomes: the viewer renders when it likes, and a rendering takes all devices."""
 
 
 class ShardedPipeline(NrfgsPipeline):
@@ -58,12 +52,6 @@ class ShardedPipeline(NrfgsPipeline):
         losses = self.model.get_loss_dict(outputs, batch)
         return outputs, losses, self.model.get_metrics_dict(outputs, batch) if with_metrics else {}
 
-    def get_average_eval_image_metrics(
-        self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
-    ) -> dict[str, Any]:
-        """Every device renders every test image, each from its splats and those of the others: the same numbers."""
-        return super().get_average_eval_image_metrics(step, output_path if comm.rank() == 0 else None, get_std)
-
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore the order of the cameras; torch's generators differ between devices, and go on as they are."""
         self.datamanager.load_sampling_state(state["sampling"])
@@ -77,8 +65,7 @@ class ShardedMean(ParameterMean):
 
     def is_current(self, optimizers: Mapping[str, Optimizer]) -> bool:
         """Whether the rows of all devices still denote the splats that were averaged. The host waits for the answer."""
-        here = super().is_current(optimizers)
-        return all(comm.gather_counts(int(here), parameters_of(next(iter(optimizers.values())))[0].device))
+        return all(comm.gather(super().is_current(optimizers)))
 
 
 class ShardedGuard(Guard):
@@ -96,9 +83,9 @@ class ShardedGuard(Guard):
         anywhere = torch.stack([bad, torch.full_like(bad, float(self.request.signal or 0))])
         dist.all_reduce(anywhere, dist.ReduceOp.MAX)
         elsewhere = torch.where(anywhere[0] > bad, math.inf, 0.0)
-        watched = [Watched(ELSEWHERE, "elsewhere", elsewhere), Watched(ASKED, "elsewhere", anywhere[1])]
-        sizes = torch.cat([sizes, elsewhere[None], anywhere[1:]])
-        return replace(verdict, watched=[*verdict.watched, *watched], sizes=sizes)
+        watched = [*verdict.watched, Watched("a number on another device", "elsewhere", elsewhere)]
+        watched.append(Watched("a signal", "elsewhere", anywhere[1]))
+        return Verdict(verdict.step, watched, torch.cat([sizes, elsewhere[None], anywhere[1:]]))
 
     def _read(self, verdict: Verdict) -> list[float]:
         sizes = super()._read(verdict)
@@ -120,14 +107,14 @@ class ShardedGuard(Guard):
             super().check_parameters(optimizers)
         except TrainingStopped as error:
             stopped = error
-        if max(comm.gather_counts(int(stopped is not None), self.model.device)) > 0:
+        if any(comm.gather(stopped is not None)):
             raise self._together(stopped) from None
 
     def _together(self, stopped: TrainingStopped | None) -> TrainingStopped:
         """One exception for all devices: from the first whose own image or loss is bad, which spreads to all
         gradients; otherwise of the first that found something itself."""
         mine = None if stopped is None else (str(stopped), stopped.step, stopped.origin, stopped.savable)
-        stops = [(device, *stop) for device, stop in enumerate(comm.gather_objects(mine)) if stop is not None]
+        stops = [(device, *stop) for device, stop in enumerate(comm.gather(mine)) if stop is not None]
         own = [stop for stop in stops if stop[3] != "elsewhere"]
         device, message, step, origin, _ = next((stop for stop in own if stop[3] == "rendering"), own[0])
         savable = all(stop[4] for stop in stops)
@@ -148,10 +135,10 @@ class ShardedOptimizers(LeanOptimizers):
         super().step()
 
     def load_optimizers(self, loaded_state: dict[str, Any]) -> None:
-        """Load this device's rows of a whole checkpoint; the model has been loaded."""
+        """Load this device's rows of a whole checkpoint."""
         own = dict(loaded_state)
         for name in self.model.gauss_params:
-            own[name] = map_moments(own[name], lambda table: table[self.model.loaded])
+            own[name] = map_moments(own[name], own_rows)
         super().load_optimizers(own)
 
 
@@ -162,12 +149,12 @@ class ShardedTrainer(NrfgsTrainer):
         if config.machine.device_type == "cuda":
             torch.cuda.set_device(local_rank)
         CONSOLE.quiet = comm.rank() > 0
-        vis = WITHOUT_VIEWER.get(config.vis, config.vis.removeprefix("viewer+"))
-        if vis != config.vis:
+        vis = config.vis.removeprefix("viewer+")
+        vis = "tensorboard" if vis.startswith("viewer") else vis
+        if vis != config.vis:  # the viewer renders when it likes, and a rendering takes all devices
             CONSOLE.print(f"No viewer while training on several devices: --vis {config.vis} is {vis} here.")
         config = replace(config, vis=vis, pipeline=replace(config.pipeline, _target=ShardedPipeline))
         super().__init__(config, local_rank, world_size)
-        self.request = StopRequest(quiet=comm.rank() > 0)
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         # Nerfstudio seeds devices differently, but initial splats and the order of the cameras must be the same.

@@ -30,8 +30,8 @@ ROWS = 12
 FIXED = slice(PARAMETER.value, STEP.value + 1)
 CONSTANTS = slice(RATE.value, DECAY.value + 1)
 
-Group = tuple[dict[str, Any], list[Tensor], list[dict[str, Tensor]]]
-"""torch's options of some parameters (lr, betas, eps, weight_decay), the parameters, and their states."""
+Part = tuple[dict[str, Any], Tensor, dict[str, Tensor]]
+"""torch's options of a parameter (lr, betas, eps, weight_decay), the parameter, and its state."""
 
 
 @triton.jit
@@ -114,11 +114,10 @@ class AdamTable:
         self.fixed: list[int] = []
         self.programs = 0
 
-    def step(self, work: list[Group], skip: Tensor | None) -> bool:
+    def step(self, work: list[Part], skip: Tensor | None) -> bool:
         """One step, in place, of parameters with gradients whose counters have counted it.
 
         Args:
-            work: all groups.
             skip: a number on the device, not 0 to skip the step and uncount it; None: do not skip.
 
         Returns:
@@ -129,20 +128,18 @@ class AdamTable:
         gradients: list[int] = []
         constants: list[tuple] = []
         aligned = True
-        for group, parameters, states in work:
-            constant = (group["lr"], *group["betas"], group["eps"], group["weight_decay"])
-            for parameter, state in zip(parameters, states, strict=True):
-                mean, square, gradient = state["exp_avg"], state["exp_avg_sq"], parameter.grad
-                fixed += (parameter.data_ptr(), mean.data_ptr(), square.data_ptr(), state["step"].data_ptr())
-                fixed.append(parameter.numel())
-                gradients.append(gradient.data_ptr())
-                aligned = aligned and gradient.is_contiguous() and gradients[-1] % ALIGNMENT == 0
-                constants.append(constant)
+        for group, parameter, state in work:
+            mean, square, gradient = state["exp_avg"], state["exp_avg_sq"], parameter.grad
+            fixed += (parameter.data_ptr(), mean.data_ptr(), square.data_ptr(), state["step"].data_ptr())
+            fixed.append(parameter.numel())
+            gradients.append(gradient.data_ptr())
+            aligned = aligned and gradient.is_contiguous() and gradients[-1] % ALIGNMENT == 0
+            constants.append((group["lr"], *group["betas"], group["eps"], group["weight_decay"]))
         if self.copied is not None:
             self.copied.synchronize()  # the copy of the step before, which has long been made
         if not aligned or (fixed != self.fixed and not self._write_fixed(work, fixed)):
             return False
-        base = work[0][1][0]
+        base = work[0][1]
         count = len(gradients)
         self.numbers[CONSTANTS, :count] = np.array(constants).T
         self.rows[GRADIENT, :count] = (np.array(gradients) - base.data_ptr()) >> 2
@@ -151,26 +148,20 @@ class AdamTable:
             self.copied.record()
         skip = self.never if skip is None else skip
         launch((self.programs, 1, 1), base, self.device, skip, BLOCK=BLOCK, COLUMNS=COLUMNS, num_warps=WARPS)
-        for _, parameters, _ in work:  # PyTorch cannot know that they have been written to
-            for parameter in parameters:
-                torch.autograd.graph.increment_version(parameter)
+        for _, parameter, _ in work:  # PyTorch cannot know that they have been written to
+            torch.autograd.graph.increment_version(parameter)
         return True
 
-    def _write_fixed(self, work: list[Group], fixed: list[int]) -> bool:
+    def _write_fixed(self, work: list[Part], fixed: list[int]) -> bool:
         """Write the addresses and sizes that stay from step to step; whether the kernel takes these tensors."""
         self.fixed = []
-        parts = [
-            tensor
-            for _, parameters, states in work
-            for parameter, state in zip(parameters, states, strict=True)
+        if len(work) > COLUMNS or not all(
+            tensor.dtype == torch.float32
+            and tensor.device == self.device.device
+            and tensor.is_contiguous()
+            and tensor.data_ptr() % ALIGNMENT == 0
+            for _, parameter, state in work
             for tensor in (parameter, state["exp_avg"], state["exp_avg_sq"])
-        ]
-        if len(fixed) > 5 * COLUMNS or not all(
-            part.dtype == torch.float32
-            and part.device == self.device.device
-            and part.is_contiguous()
-            and part.data_ptr() % ALIGNMENT == 0
-            for part in parts
         ):
             return False
         each = np.array(fixed).reshape(-1, 5).T

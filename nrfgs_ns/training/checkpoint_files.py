@@ -28,7 +28,7 @@ class DiskFull(ForTheUser, RuntimeError):
     """A checkpoint could not be written: no space, a quota, or a limit on file sizes."""
 
 
-class Damaged(ValueError):
+class Damaged(InputError):
     """A file is not the checkpoint that was written."""
 
 
@@ -81,25 +81,17 @@ def read(path: Path) -> dict[str, Any]:
     allow_nerfstudio_checkpoints()
     try:
         with zipfile.ZipFile(path) as archive:
-            bad = archive.testzip()
-        if bad is not None:
-            raise Damaged(f"the checksum of its record {bad} is wrong")
+            if (bad := archive.testzip()) is not None:
+                raise ValueError(f"the checksum of its record {bad} is wrong")
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except (FileNotFoundError, Damaged):
+        if not isinstance(content, dict) or not {"step", "pipeline"} <= content.keys():
+            raise ValueError("it is not a checkpoint of nerfstudio")
+        return content
+    except FileNotFoundError:
         raise
     except Exception as error:  # damage to a zip archive, or to a pickle in it, can raise anything
-        raise Damaged(str(error).splitlines()[0][:200] if str(error) else type(error).__name__) from error
-    if not isinstance(content, dict) or not {"step", "pipeline"} <= content.keys():
-        raise Damaged("it is not a checkpoint of nerfstudio")
-    return content
-
-
-def read_or_refuse(path: Path) -> dict[str, Any]:
-    """As `read`, with an InputError where the file is damaged."""
-    try:
-        return read(path)
-    except Damaged as damage:
-        raise InputError(f"{path} is damaged: {damage}. Restore it from a copy, or take an older one.") from damage
+        reason = next(iter(str(error).splitlines()), type(error).__name__)[:200]
+        raise Damaged(f"{path} is damaged: {reason}. Restore it from a copy, or take another one.") from error
 
 
 def read_latest(folder: Path, step: int | None = None) -> tuple[Path, dict[str, Any]]:
@@ -110,17 +102,17 @@ def read_latest(folder: Path, step: int | None = None) -> tuple[Path, dict[str, 
         if step not in checkpoints:
             raise InputError(f"{folder} has no checkpoint of step {step}, only of {', '.join(map(str, checkpoints))}.")
         checkpoints = {step: checkpoints[step]}
-    damages = ""
+    damages: list[str] = []
     for path in checkpoints.values():
         try:
             content = read(path)
         except Damaged as damage:
-            damages += f"{path} is damaged: {damage}. "
-            continue
-        if damages:
-            warn(f"{damages}Taking the one before, {path.name}.")
-        return path, content
-    raise InputError(f"{damages}Restore it from a copy, or train anew.")
+            damages.append(str(damage))
+        else:
+            if damages:
+                warn(f"{' '.join(damages)} Taking the one before, {path.name}.")
+            return path, content
+    raise InputError(" ".join(damages))
 
 
 def checkpoints_in(folder: Path) -> dict[int, Path]:

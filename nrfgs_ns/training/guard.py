@@ -17,8 +17,8 @@ rasterizer does not draw them, so no gradient shows them) are removed before the
 """
 
 import math
+from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import torch
@@ -37,16 +37,12 @@ PARAMETERS_EVERY = 100
 """Steps between two checks of the parameters."""
 PATIENCE = 100
 """Steps in a row without a visible splat after which the training stops."""
-HUGE = {"scales": 20.0, "means": 1e6, "quats": math.inf}
-"""Values (log-scales, scene units) that no training reaches with suitable learning rates. Quaternions are normalised,
-so theirs may have any length. All other tensors (logits, a head's per-splat tensors, shared weights): `HUGE_OTHERWISE`.
-"""
-HUGE_OTHERWISE = 1e3
+HUGE = defaultdict(lambda: 1e3, scales=20.0, means=1e6, quats=math.inf)
+"""Values (log-scales, scene units, logits, a head's own) that no training reaches with suitable learning rates.
+Quaternions are normalised, so theirs may have any length."""
 
 Origin = Literal["rendering", "gradient", "parameter", "elsewhere", "nothing visible", "memory"]
 """Cause of a stop; "rendering": a number in the image or a loss, "elsewhere": on another device."""
-Findings = list[tuple[str, float, Tensor]]
-"""Tensors that condemned a step: name, largest absolute value (NaN, infinite or too large), values."""
 
 
 class TrainingStopped(ForTheUser, RuntimeError):
@@ -68,14 +64,12 @@ class Watched(NamedTuple):
     tensor: Tensor
 
 
-@dataclass
-class Verdict:
-    """The largest absolute values of a step's watched tensors, in host memory once `arrived` has happened."""
+class Verdict(NamedTuple):
+    """The largest absolute values of a step's watched tensors."""
 
     step: int
     watched: list[Watched]
     sizes: Tensor
-    arrived: torch.cuda.Event | None = None
 
 
 class Guard:
@@ -88,7 +82,7 @@ class Guard:
         self._verdict: Verdict | None = None
         # Pinned memory and events are expensive to make; one of each suffices, since a verdict is read before the next.
         self._in_host_memory: Tensor | None = None
-        self._arrival: torch.cuda.Event | None = None
+        self._arrived: torch.cuda.Event | None = None
 
     def begin(self, step: int, optimizers: LeanOptimizers, settled_later: bool = False) -> None:
         """Read the verdict on the step before, and now and then check the parameters. Raises TrainingStopped.
@@ -121,7 +115,7 @@ class Guard:
         for optimizer in optimizers.optimizers.values():
             optimizer.found_inf = condemned
         if sizes.is_cuda:
-            self._send_home(self._verdict)
+            self._send_home(sizes)
 
     def _check_number(self) -> None:
         """Raise TrainingStopped where no splat is left, on any device."""
@@ -146,14 +140,13 @@ class Guard:
         """Add other devices' findings (`distributed`)."""
         return verdict
 
-    def _send_home(self, verdict: Verdict) -> None:
-        """Copy a verdict's sizes to the host without waiting for them."""
-        if self._in_host_memory is None or self._in_host_memory.shape != verdict.sizes.shape:
-            self._in_host_memory = torch.empty_like(verdict.sizes, device="cpu", pin_memory=True)
-            self._arrival = torch.cuda.Event()
-        verdict.sizes = self._in_host_memory.copy_(verdict.sizes, non_blocking=True)
-        verdict.arrived = self._arrival
-        verdict.arrived.record()
+    def _send_home(self, sizes: Tensor) -> None:
+        """Copy the verdict's sizes to the host without waiting for them."""
+        if self._in_host_memory is None or self._in_host_memory.shape != sizes.shape:
+            self._in_host_memory = torch.empty_like(sizes, device="cpu", pin_memory=True)
+            self._arrived = torch.cuda.Event()
+        self._verdict = self._verdict._replace(sizes=self._in_host_memory.copy_(sizes, non_blocking=True))
+        self._arrived.record()
 
     def settle(self) -> None:
         """Read the verdict on the step before; TrainingStopped if it was condemned."""
@@ -171,20 +164,18 @@ class Guard:
 
     def _read(self, verdict: Verdict) -> list[float]:
         """Wait for a verdict's sizes."""
-        if verdict.arrived is not None:
-            verdict.arrived.synchronize()
+        if self._arrived is not None:
+            self._arrived.synchronize()
         return verdict.sizes.tolist()
 
     def check_parameters(self, optimizers: LeanOptimizers) -> None:
         """Remove the splats that are not finite and raise TrainingStopped, savable unless a shared weight is not finite
         either, or no splat is left."""
         self._check_number()
-        named = {name: value for name, value in self.pipeline.named_parameters() if value.numel() > 0}
-        sizes = [size.item() for size in torch._foreach_norm(list(named.values()), math.inf)] if named else []
         findings = [
-            (name.removeprefix("_model."), size, named[name].detach())
-            for name, size in zip(named, sizes, strict=True)
-            if not math.isfinite(size)
+            (name.removeprefix("_model."), size, value.detach())
+            for name, value in self.pipeline.named_parameters()
+            if value.numel() > 0 and not math.isfinite(size := value.norm(math.inf).item())
         ]
         if not findings:
             return
@@ -200,8 +191,9 @@ class Guard:
         raise TrainingStopped(message, self.step, "parameter", savable)
 
 
-def report(pipeline, step: int, findings: Findings, limit: float) -> str:
-    """The message of a stop: the first tensor, its splats, and the likely cause."""
+def report(pipeline, step: int, findings: list[tuple[str, float, Tensor]], limit: float) -> str:
+    """The message of a stop: the first tensor, its splats, and the likely cause. `findings` are a tensor's name, its
+    largest absolute value (NaN, infinite or beyond the limit), and its values."""
     model = pipeline.model
     first, size, _ = findings[0]
     what = "has NaN" if math.isnan(size) else "is infinite"
@@ -244,7 +236,7 @@ def _cause(model, names: list[str], image: object) -> str:
     if "loss main_loss" in names and "the rendered image" not in names:
         return f"the rendering is finite and its loss is not, so the image or mask is broken: {image}. Replace it."
     for group, value in (*model.gauss_params.items(), *(("field", weight) for weight in model.head.parameters())):
-        if value.numel() and not (reached := value.abs().max().item()) <= HUGE.get(group, HUGE_OTHERWISE):  # or NaN
+        if value.numel() and not (reached := value.abs().max().item()) <= HUGE[group]:  # or NaN
             return (
                 f"a learning rate that is too high: {group} have reached {reached:.2g}. Lower "
                 f"--optimizers.{group}.optimizer.lr and start from an older checkpoint."

@@ -5,10 +5,11 @@ the world is refused; learning rates, thresholds and steps may change.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datasets.base_dataset import InputDataset
 
 from nrfgs_ns.data.cameras import LENS
 from nrfgs_ns.data.checks import shown, some
@@ -45,11 +46,11 @@ def options_of(config: Any) -> dict[str, str]:
     }
 
 
-def data_set_of(names: list[str], cameras: Cameras) -> dict[str, Any]:
+def data_set_of(data: InputDataset) -> dict[str, Any]:
     """The names of a data set's images, and its cameras' centres, [V, 3], and `LENS`, [V, 6]."""
-    centers = cameras.camera_to_worlds[:, :3, 3].detach().cpu().clone()
-    lenses = torch.cat([getattr(cameras, name).double() for name in LENS], dim=-1).cpu()
-    return {"images": names, "centers": centers, "lenses": lenses}
+    centers = data.cameras.camera_to_worlds[:, :3, 3].detach().cpu().clone()
+    lenses = torch.cat([getattr(data.cameras, name).double() for name in LENS], dim=-1).cpu()
+    return {"images": [Path(name).name for name in data.image_filenames], "centers": centers, "lenses": lenses}
 
 
 def check_data_set(written: Mapping[str, Any], here: Mapping[str, Any], data: object, to_train: bool) -> None:

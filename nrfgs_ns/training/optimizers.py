@@ -15,9 +15,7 @@ from nerfstudio.utils import writer
 from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
-from torch.optim.lr_scheduler import LambdaLR
 
-from nrfgs_ns.errors import InputError
 from nrfgs_ns.kernels.trial import tried_once
 from nrfgs_ns.training.pace import Pace
 
@@ -31,27 +29,15 @@ class LeanOptimizers(Optimizers):
     """
 
     def __init__(self, config, param_groups, steps_per_log: int = 10, pace: Pace | None = None):
-        if missing := sorted(param_groups.keys() - config.keys()):
-            fix = f"Register it with {missing[0]}=adam(LEARNING_RATE), as in docs/contributing.md."
-            raise InputError(f"The method has no optimizer for its head's {', '.join(missing)}. {fix}")
         super().__init__(config, param_groups)
         self.steps_per_log = steps_per_log
         self.pace = pace
         self._tables: dict[torch.device, Any] = {}
         """not shared with a twin's, since the host waits for the copy of the last step's"""
-        self.fuse()
-
-    def fuse(self) -> None:
-        """Run Adam fused on CUDA and unfused elsewhere, whatever a checkpoint says."""
         for optimizer in self.optimizers.values():
-            if isinstance(optimizer, Adam):
-                on_cuda = all(parameter.is_cuda for parameter in parameters_of(optimizer))
+            if isinstance(optimizer, Adam) and all(parameter.is_cuda for parameter in parameters_of(optimizer)):
                 for group in optimizer.param_groups:
-                    group["fused"] = True if on_cuda else None
-                    group["foreach"] = False if on_cuda else None
-                for parameter, state in optimizer.state.items():
-                    if "step" in state:
-                        state["step"] = state["step"].to(parameter.device if on_cuda else "cpu")
+                    group["fused"], group["foreach"] = True, False
 
     @property
     def all_fused(self) -> bool:
@@ -98,48 +84,41 @@ class LeanOptimizers(Optimizers):
         optimizer = self.optimizers[name]
         optimizer.param_groups[0]["params"] = self.parameters[name] = parameters
         optimizer.state.clear()
-        self.fuse()
 
     def load_optimizers(self, loaded_state) -> None:
-        """Load the moments; options such as learning rates stay this training's."""
+        """Load the moments; options such as learning rates, or whether Adam is fused, stay this training's."""
         for name, state in loaded_state.items():
             optimizer = self.optimizers[name]
-            options_before = [{k: v for k, v in group.items() if k != "params"} for group in optimizer.param_groups]
-            optimizer.load_state_dict(state)
-            for group, options in zip(optimizer.param_groups, options_before, strict=True):
-                group.update(options)
-        self.fuse()
+            optimizer.load_state_dict({**state, "param_groups": optimizer.state_dict()["param_groups"]})
 
     def load_schedulers(self, loaded_state) -> None:
         """Load the positions on the schedules, which stay this training's."""
         for name, state in loaded_state.items():
             scheduler = self.schedulers[name]
             scheduler.load_state_dict({**state, "base_lrs": scheduler.base_lrs})
-            rates = scheduler.get_last_lr()
-            if isinstance(scheduler, LambdaLR):  # the state holds the checkpoint's rates, not this training's
-                pairs = zip(scheduler.base_lrs, scheduler.lr_lambdas, strict=True)
-                rates = [base * factor(scheduler.last_epoch) for base, factor in pairs]
-            for group, rate in zip(self.optimizers[name].param_groups, rates, strict=True):
-                group["lr"] = rate
+            parts = self.optimizers[name].param_groups, scheduler.base_lrs, scheduler.lr_lambdas
+            for group, base, factor in zip(*parts, strict=True):
+                group["lr"] = base * factor(scheduler.last_epoch)
 
 
 def step_at_once(optimizers: Sequence[Adam], tables: dict[torch.device, Any]) -> bool:
     """Make one step of several fused Adams that have state by one Triton kernel, if it runs; returns whether it did. As
     in torch, the step changes nothing where the optimisers' `found_inf`, a tensor on the device, is 1. `tables` keeps
     the device's `AdamTable`."""
-    work: list[tuple[dict[str, Any], list[Tensor], list[dict[str, Tensor]]]] = []
-    for optimizer in optimizers:
-        for group in optimizer.param_groups:
-            parameters = [parameter for parameter in group["params"] if parameter.grad is not None]
-            if parameters:
-                work.append((group, parameters, [optimizer.state[parameter] for parameter in parameters]))
-    device = work[0][1][0].device if work else torch.device("cpu")
+    work = [
+        (group, parameter, optimizer.state[parameter])
+        for optimizer in optimizers
+        for group in optimizer.param_groups
+        for parameter in group["params"]
+        if parameter.grad is not None
+    ]
+    device = work[0][1].device if work else torch.device("cpu")
     skips = [getattr(optimizer, "found_inf", None) for optimizer in optimizers]
     if device.type != "cuda" or any(skip is not skips[0] for skip in skips) or not try_kernel(device):
         return False
     from nrfgs_ns.training.adam_triton import AdamTable
 
-    counters = [state["step"] for _, _, states in work for state in states]
+    counters = [state["step"] for _, _, state in work]
     with torch.no_grad():
         torch._foreach_add_(counters, 1)
         if device not in tables:
@@ -160,7 +139,7 @@ def try_kernel(device: torch.device) -> None:
     state = {name: torch.ones(1, device=device) for name in ("exp_avg", "exp_avg_sq", "step")}
     group = {"lr": 0.1, "betas": (0.9, 0.999), "eps": 1e-15, "weight_decay": 0.0}
     with torch.no_grad():
-        AdamTable(device).step([(group, [number], [state])], None)
+        AdamTable(device).step([(group, number, state)], None)
 
 
 def is_fused(optimizer: Optimizer) -> bool:

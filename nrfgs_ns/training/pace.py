@@ -58,9 +58,6 @@ class Pace:
     def start(self) -> None:
         """Training begins, or goes on, now."""
 
-    def begin_step(self) -> None:
-        """A step begins now."""
-
     def advance(self) -> None:
         """Move on to the next step's position."""
         self.position = min(self.position + self.rate, float(self.length))
@@ -103,7 +100,7 @@ class TimedPace(Pace):
         self.earlier_seconds = 0.0
         """seconds before the checkpoint that the training goes on from"""
         self._training_began: float | None = None
-        self._step_began: float | None = None
+        self._advanced = 0.0
         self._durations: deque[float] = deque(maxlen=STEPS_IN_MEDIAN)
 
     @property
@@ -129,16 +126,12 @@ class TimedPace(Pace):
         return math.ceil((self.length - self.position) / self.rate)
 
     def start(self) -> None:
-        self._training_began = self.clock()
-        self._step_began = None
-
-    def begin_step(self) -> None:
-        now = self.clock()
-        if self._step_began is not None:
-            self._durations.append(now - self._step_began)
-        self._step_began = now
+        self._training_began = self._advanced = self.clock()
 
     def advance(self) -> None:
+        now = self.clock()
+        self._durations.append(now - self._advanced)
+        self._advanced = now
         if len(self._durations) >= STEPS_BEFORE_PLANNING:
             step = self.step_seconds
             # The schedules' last position is for the last step, not for one behind it.

@@ -43,8 +43,6 @@ from nrfgs_ns.viewer.panel import ViewerPanel
 
 SHOWN = ("psnr", "cc_psnr", "ssim", "cc_ssim", "ms_ssim", "lpips", "l1", "seconds_per_image", "splats")
 """Columns of an evaluation's table."""
-SMALLEST_SIDE = 2
-"""Fewest pixels along each side of an image at the lowest resolution: SSIM takes a side of one for none."""
 
 
 @dataclass
@@ -93,7 +91,6 @@ class NrfgsPipeline(VanillaPipeline):
         if test_mode == "val":  # ns-train; ns-eval and ns-render read the images that they need
             trials = [partial(trial, self.model.device) for trial in kernels_of(self.model.head) if on_cuda]
             with tried_meanwhile(trials, self.model.device):
-                self._check_smallest_image()
                 self.datamanager.load_all_images()
                 photographs = photograph_model(config.model, self.datamanager)
             self.model.learn_photographs(photographs)
@@ -110,15 +107,6 @@ class NrfgsPipeline(VanillaPipeline):
             cameras.rescale_output_resolution(1 / (factor or 1))
         return cameras
 
-    def _check_smallest_image(self) -> None:
-        """Raise InputError where a training's first images are too small for SSIM."""
-        cameras = self.datamanager.train_dataset.cameras
-        factor = 2**self.config.model.num_downscales
-        width, height = (int(side.min()) // factor for side in (cameras.width, cameras.height))
-        if min(width, height) < SMALLEST_SIDE:
-            fix = "Give a smaller --pipeline.model.num-downscales, or larger images."
-            raise InputError(f"Training would begin with images of {width} x {height} pixels, too few for SSIM. {fix}")
-
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint, or the compact file that the configuration names; InputError if it does not fit.
 
@@ -126,7 +114,7 @@ class NrfgsPipeline(VanillaPipeline):
         """
         training = self.test_mode == "val"
         if (scene := loaded_state.get("_extra_state", {}).get("scene")) is not None:  # a compact file has none
-            here, data = self._data_set(), self.datamanager.get_datapath()
+            here, data = data_set_of(self.datamanager.train_dataset), self.datamanager.get_datapath()
             try:
                 check_data_set(scene, here, data, training)
             except InputError as error:
@@ -206,12 +194,8 @@ class NrfgsPipeline(VanillaPipeline):
             "cuda_rng": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
             "python_rng": json.dumps(random.getstate()),
             "sampling": self.datamanager.sampling_state(),
-            "scene": self._data_set(),
+            "scene": data_set_of(self.datamanager.train_dataset),
         }
-
-    def _data_set(self) -> dict[str, Any]:
-        data = self.datamanager.train_dataset
-        return data_set_of([Path(name).name for name in data.image_filenames], data.cameras)
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` gave, in a training; an evaluation ignores it."""

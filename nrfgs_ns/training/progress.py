@@ -53,8 +53,6 @@ def end_earlier_logs() -> None:
 class ProgressLine(LocalWriter):
     """One line that is updated on a terminal, and repeated now and then in a file.
 
-    The trainer calls `write_stats_log` after each step, nerfstudio's loop after those that are logged.
-
     Args:
         banner_messages: lines printed once above it: the viewer's address.
     """
@@ -69,7 +67,6 @@ class ProgressLine(LocalWriter):
         """step and time of the last update"""
         self._due = 0.0
         """time of the next update"""
-        self._first = 0
 
     def watch(self, pipeline: Any, lock: Lock) -> None:
         """Report the PSNR of the middle test view, if there is any, rendered under the viewer's lock."""
@@ -82,14 +79,13 @@ class ProgressLine(LocalWriter):
             kind = "training" if name in data.train_dataset.image_filenames else "test"
             self._view_name = f"{kind} view {name.name}"
 
-    def begin(self, step: int) -> None:
-        """Set the training's first step; before it nerfstudio logs under step 0."""
-        self._first = step
-
     def write_stats_log(self, step: int) -> None:
+        """Nothing: the trainer calls `update` after each step. Nerfstudio's first call names another step."""
+
+    def update(self, step: int) -> None:
         """Update the line if it is due."""
         if perf_counter() >= self._due:
-            self._update(max(step, self._first))
+            self._update(step)
 
     def finish(self, step: int) -> None:
         """Show the result of the last step and leave the line there."""

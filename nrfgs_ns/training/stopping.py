@@ -7,12 +7,12 @@ on disk is the same as an uninterrupted training's. A second Ctrl-C ends the pro
 
 import os
 import signal
-import threading
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from time import monotonic
 
 import torch
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.optim import Optimizer
 
@@ -29,8 +29,7 @@ class StopRequest:
         is_over: whether the training has ended, so that signals end the process as usual.
     """
 
-    def __init__(self, quiet: bool = False):
-        self.quiet = quiet
+    def __init__(self):
         self.signal: signal.Signals | None = None
         self.is_over = False
         self._heard_at = 0.0
@@ -44,7 +43,7 @@ class StopRequest:
             self._heard_at = monotonic()
             if self.signal.name == "SIGHUP":
                 _let_go_of_terminal()
-            elif not self.quiet:
+            elif not CONSOLE.quiet:
                 _say("Stopping when this step is done. Ctrl-C again stops at once, and saves nothing.")
         elif number == signal.SIGINT and monotonic() - self._heard_at > PATIENCE:
             _say("Stopped at once; what was not saved yet is lost.")
@@ -53,19 +52,14 @@ class StopRequest:
 
 @contextmanager
 def heard_signals(request: StopRequest) -> Iterator[None]:
-    """Let signals make a request instead of ending the process, except those that are ignored (`nohup`). Outside the
-    main thread, which alone can do that, nothing changes."""
-    is_main = threading.current_thread() is threading.main_thread()
-    before = {number: signal.getsignal(number) for number in SIGNALS if is_main}
-    for number, handler in before.items():
-        if handler not in (signal.SIG_IGN, None):
-            signal.signal(number, request.hear)
+    """Let signals make a request instead of ending the process, except those that are ignored (`nohup`)."""
+    heard = [number for number in SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
+    before = {number: signal.signal(number, request.hear) for number in heard}
     try:
         yield
     finally:
         for number, handler in before.items():
-            if handler is not None:
-                signal.signal(number, handler)
+            signal.signal(number, handler)
 
 
 def is_out_of_memory(error: BaseException) -> bool:

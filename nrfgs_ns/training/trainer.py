@@ -4,7 +4,6 @@ the last steps, and an orderly end whatever its cause."""
 
 import gc
 import sys
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -41,31 +40,27 @@ NOTHING_TO_SAVE = "Stopped before the first step; there is nothing to save."
 
 
 class NrfgsTrainer(Trainer):
-    """Trainer that never leaves a torn checkpoint, or one with NaN, where `--load-dir` would find it.
+    """Trainer that never leaves a torn checkpoint, or one with NaN, where `--load-dir` would find it."""
 
-    Attributes:
-        total_steps: steps of the whole training, including those before a checkpoint.
-        line: the progress line; None: nothing is shown, or nerfstudio's table.
-        pace: position on the schedules; None: the step.
-        steps_are_chosen: whether the number of training views decides how many steps there are.
-        mean: the parameters' mean over the last steps; None without `average_steps`.
-        graphs: recorded steps; None with several devices.
-        twin: a second training to agree with; None: none.
-    """
+    config: NrfgsTrainerConfig
+    line: ProgressLine | None
+    """None: nothing is shown, or nerfstudio's table"""
+    pace: Pace | None = None
+    """position on the schedules; None: the step"""
+    steps_are_chosen = False
+    """whether the number of training views decides how many steps there are"""
+    mean: ParameterMean | None = None
+    """the parameters' mean over the last steps; None without `average_steps`"""
+    graphs: StepGraphs | None = None
+    """recorded steps; None with several devices"""
+    twin: Twin | None = None
+    """a second training to agree with; None: none"""
+    _stop = False
+    _saved_step: int | None = None
 
     def __init__(self, config: NrfgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         self.request = StopRequest()
-        self._stop = self._is_ending = False
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FutureWarning)  # nerfstudio's GradScaler
-            super().__init__(config, local_rank, world_size)
-        self.total_steps = config.max_num_iterations
-        self.steps_are_chosen = False
-        self.pace: Pace | None = None
-        self.mean: ParameterMean | None = None
-        self.graphs: StepGraphs | None = None
-        self.twin: Twin | None = None
-        self._saved_step: int | None = None
+        super().__init__(config, local_rank, world_size)
 
     @property
     def stop_training(self) -> bool:
@@ -92,7 +87,7 @@ class NrfgsTrainer(Trainer):
             super().setup(test_mode)
         except KeyboardInterrupt:
             NrfgsTrainer._end(self, NOTHING_TO_SAVE, 130)
-        writer.GLOBAL_BUFFER["max_iter"] = self.total_steps
+        writer.GLOBAL_BUFFER["max_iter"] = self.last_step + 1
         self.line = next((log for log in writer.EVENT_WRITERS if isinstance(log, ProgressLine)), None)
         if self.line is not None and self.world_size == 1:  # with several, no device can draw alone
             self.line.watch(self.pipeline, self.train_lock)
@@ -100,8 +95,7 @@ class NrfgsTrainer(Trainer):
         """the last step that was completed"""
         if self.world_size == 1:
             self.graphs = StepGraphs(self.pipeline.model, self.pipeline.datamanager, self.guard)
-        if comms.is_main_process():
-            report_choices(self.config, self.pipeline, self.steps_are_chosen, self.twin is not None)
+        report_choices(self.config, self.pipeline, self.steps_are_chosen, self.twin is not None)
         if self.twin is not None:
             self.twin.begin()
         if self.config.average_steps > 0:  # after the callbacks that change parameters
@@ -117,7 +111,6 @@ class NrfgsTrainer(Trainer):
         """The optimisers, once what depends on the views is known: the steps, the points to start from, the pace."""
         self.steps_are_chosen = self.config.max_num_iterations == 0 and self.config.time_budget is None
         self.config = self.config.for_views(self.pipeline.model.num_views)
-        self.total_steps = self.config.max_num_iterations
         self.start_densely()
         self.guard = Guard(self.pipeline)
         self.mean = ParameterMean() if self.config.average_steps > 0 else None
@@ -131,11 +124,10 @@ class NrfgsTrainer(Trainer):
     def _load_checkpoint(self) -> None:
         """Resume from the checkpoint that the configuration names, if any; InputError if it does not fit."""
         config = self.config
-        path = config.load_checkpoint
         if config.load_dir is not None:
             path, content = checkpoint_files.read_latest(config.load_dir, config.load_step)
-        elif path is not None:
-            content = checkpoint_files.read_or_refuse(path)
+        elif (path := config.load_checkpoint) is not None:
+            content = checkpoint_files.read(path)
         else:
             return
         if "optimizers" not in content:
@@ -146,16 +138,16 @@ class NrfgsTrainer(Trainer):
         training = content["training"]
         self.pipeline.load_pipeline(content["pipeline"], content["step"])
         check_options(training["options"], options_of(config))
-        if config.time_budget is None and self._start_step >= self.total_steps:
+        left = config.max_num_iterations - self._start_step
+        if config.time_budget is None and left <= 0:
             schedules = "" if config.schedule_steps is None else f" --schedule-steps {config.schedule_steps}"
             longer = f"--max-num-iterations {2 * self._start_step}{schedules} makes as many more"
             raise InputError(f"{path} is the end of a training of {self._start_step:,} steps: {longer}.")
         if weights := list(self.pipeline.model.head.parameters()):  # of a smaller head, perhaps, than was built
             self.optimizers.replace_parameters("field", weights)
         self.optimizers.load_optimizers(content["optimizers"])
-        if "schedulers" in content and config.load_scheduler:
+        if config.load_scheduler:
             self.optimizers.load_schedulers(content["schedulers"])
-        left = self.total_steps - self._start_step
         resume(self.pace, training.get("pace"), self._start_step, left, self.world_size)
         if not isinstance(self.pace, TimedPace):
             self.config = replace(self.config, max_num_iterations=left)
@@ -169,7 +161,7 @@ class NrfgsTrainer(Trainer):
         elif self.twin is not None:
             self.twin.load_state(training["twin"])
         budget = config.time_budget
-        total = f"{self.total_steps:,}" if budget is None else f"as many as fit into {budget:g} minutes"
+        total = f"{config.max_num_iterations:,}" if budget is None else f"as many as fit into {budget:g} minutes"
         CONSOLE.print(f"Going on from {path}, at step {self._start_step} of {total}.", markup=False, soft_wrap=True)
 
     def optimizer_configs(self) -> dict[str, Any]:
@@ -191,8 +183,6 @@ class NrfgsTrainer(Trainer):
         self._check_parameters(self._start_step)
         if isinstance(self.pace, TimedPace):  # the clock says which step is the last
             self.config = replace(self.config, max_num_iterations=sys.maxsize // 2)
-        if self.line is not None:
-            self.line.begin(self._start_step)
         gc.collect()
         gc.freeze()  # all present objects stay: the collector need not visit them
         try:
@@ -211,8 +201,8 @@ class NrfgsTrainer(Trainer):
         super()._update_viewer_state(step)
         if step % self.config.logging.steps_per_log != 0:
             writer.EVENT_STORAGE.clear()
-            if self.line is not None:
-                self.line.write_stats_log(step)
+        if self.line is not None:
+            self.line.update(step)
 
     @check_eval_enabled
     def eval_iteration(self, step: int) -> None:
@@ -227,7 +217,6 @@ class NrfgsTrainer(Trainer):
         """One step; TrainingStopped where it, or on a GPU the one before, met a number that is not finite."""
         model, pace, optimizers = self.pipeline.model, self.pace, self.optimizers
         if pace is not None:
-            pace.begin_step()
             model.densification.reschedule(lambda position: pace.step_at(position, step))
         with self._last_good_state_on_disk():
             pulled = {} if self.twin is None else self.twin.make_step(step)
@@ -267,7 +256,7 @@ class NrfgsTrainer(Trainer):
         """Nerfstudio's, with the right step number: its own is one too high after an early stop. Before it, the mean
         becomes the model; a signal ends the training here."""
         self.step = self._completed_step
-        self._is_ending = True
+        self.training_state = "completed"
         timed_out = isinstance(self.pace, TimedPace) and self.pace.is_spent
         if self._signal and not timed_out and self._completed_step < self.last_step:
             outcome = NOTHING_TO_SAVE
@@ -303,10 +292,8 @@ class NrfgsTrainer(Trainer):
         exception again; TrainingStopped where memory has run out."""
         try:
             yield
-        except (InputError, TrainingStopped, DiskFull):
-            raise
         except Exception as error:
-            if self.world_size > 1:  # one device alone cannot write the whole
+            if isinstance(error, ForTheUser) or self.world_size > 1:  # one device alone cannot write the whole
                 raise
             if not is_out_of_memory(error):
                 print(f"The training failed in step {self.step}. {self._save_last_step()}", flush=True)
@@ -315,12 +302,11 @@ class NrfgsTrainer(Trainer):
             outcome = self._save_last_step()
             reason = str(error).partition("\n")[0]
             message = f"Out of memory in step {self.step}: {reason}\n{outcome} Fewer splats or smaller images take less"
-            savable = self._saved_step == self._completed_step
-            raise TrainingStopped(f"{message} (docs/troubleshooting.md).", self.step, "memory", savable) from None
+            raise TrainingStopped(f"{message} (docs/troubleshooting.md).", self.step, "memory") from None
 
     def _save_last_step(self) -> str:
         """Save the state after the last completed step, if it is consistent; returns a sentence about the outcome."""
-        self._is_ending = True
+        self.training_state = "completed"
         last = next(iter(checkpoint_files.find(self.checkpoint_dir).values()), None)
         kept = f"The last checkpoint is {last}." if last else "This training has written no checkpoint."
         if self._completed_step < self._start_step:
@@ -361,7 +347,7 @@ class NrfgsTrainer(Trainer):
         try:
             self._write_checkpoint(step)
         except DiskFull as full:
-            if self._is_ending:
+            if self.training_state == "completed":
                 raise
             warn(f"{full} The training goes on.")
 

@@ -6,6 +6,7 @@ import os
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import count
+from operator import attrgetter
 from pathlib import Path
 from pkgutil import resolve_name
 
@@ -17,14 +18,11 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from nrfgs_ns.data.checks import shown
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
-from nrfgs_ns.errors import DEBUG, InputError
+from nrfgs_ns.errors import InputError
 from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.config_file import check_types
 from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS, Pace, TimedPace, resolution_phases, steps_for
 
-TRAINER = "nrfgs_ns.training.trainer:NrfgsTrainer"
-SEVERAL_DEVICES = "nrfgs_ns.distributed"
-"""These import this module."""
 AVERAGED = 200
 """Steps to average in the presets and where the steps are chosen by the views."""
 MOST = 2**32
@@ -41,7 +39,7 @@ PLAIN = {"markup": False, "highlight": False, "soft_wrap": True}
 class NrfgsTrainerConfig(TrainerConfig):
     """Nerfstudio's trainer options."""
 
-    _target: type = field(default_factory=lambda: resolve_name(TRAINER))
+    _target: type = field(default_factory=lambda: resolve_name("nrfgs_ns.training.trainer:NrfgsTrainer"))
     max_num_iterations: int = STEPS
     """training steps. 0: 120 for each training view, from 10,000 to 30,000 (docs/captures.md)"""
     time_budget: float | None = None
@@ -63,15 +61,11 @@ class NrfgsTrainerConfig(TrainerConfig):
         self.check(devices)
         if devices == 1:
             return super().setup(**kwargs)
-        steps = self.max_num_iterations or STEPS
-        whole = replace(self, max_num_iterations=steps, average_steps=self.average_steps or 0)  # not stretched
-        return resolve_name(f"{SEVERAL_DEVICES}.trainer:ShardedTrainer")(whole, **kwargs)
+        whole = replace(self, max_num_iterations=self.max_num_iterations or STEPS).for_views(0)  # not stretched
+        return resolve_name("nrfgs_ns.distributed.trainer:ShardedTrainer")(whole, **kwargs)
 
     def check(self, devices: int) -> None:
         """Raise InputError where an option is out of range, is not for several devices, or names no checkpoint."""
-        for path in (self.get_base_dir(), self.data):
-            if any("\udc80" <= letter <= "\udcff" for letter in str(path)):
-                raise InputError(f"{str(path)!r} has letters beyond this system's encoding. Set PYTHONUTF8=1.")
         for name in ("mixed_precision", "use_grad_scaler", "gradient_accumulation_steps", "log_gradients"):
             if value := getattr(self, name):
                 raise InputError(f"{name} is {value}; these methods train without it. Leave it out.")
@@ -84,18 +78,12 @@ class NrfgsTrainerConfig(TrainerConfig):
         if (order := data.train_cameras_sampling_strategy) != "random":
             name = "pipeline.datamanager.train_cameras_sampling_strategy"
             raise InputError(f"{name} is {order}; these methods draw cameras at random. Leave it out.")
-        limits = [
-            ("time_budget", self.time_budget, positive),
-            ("schedule_steps", self.schedule_steps, positive),
-            ("max_num_iterations", self.max_num_iterations, 0),
-            ("average_steps", self.average_steps, 0),
-            ("pipeline.datamanager.camera_res_scale_factor", data.camera_res_scale_factor, positive),
-            ("pipeline.datamanager.max_thread_workers", data.max_thread_workers, 0),
-            ("logging.steps_per_log", self.logging.steps_per_log, 1),
-            ("machine.seed", self.machine.seed, 0),
-            ("machine.num_devices", self.machine.num_devices, 1),
-            ("machine.num_machines", self.machine.num_machines, 1),
-        ]
+        lowest = {
+            "time_budget schedule_steps pipeline.datamanager.camera_res_scale_factor": positive,
+            "max_num_iterations average_steps pipeline.datamanager.max_thread_workers machine.seed": 0,
+            "logging.steps_per_log machine.num_devices machine.num_machines": 1,
+        }
+        limits = [(name, attrgetter(name)(self), low) for names, low in lowest.items() for name in names.split()]
         for group, parts in self.optimizers.items():
             name = f"optimizers.{group}"
             schedule = parts["scheduler"]
@@ -145,10 +133,8 @@ class NrfgsTrainerConfig(TrainerConfig):
         return None if self.schedule_steps is None else Pace(length, length / self.max_num_iterations)
 
     def print_to_terminal(self) -> None:
-        """Check the options before anything is written, and print ns-train's first line, or with NRFGS_DEBUG=1 the
-        whole configuration. InputError as `check`, or where there is no data."""
-        if DEBUG:
-            super().print_to_terminal()
+        """Check the options before anything is written, and print ns-train's first line instead of the configuration.
+        InputError as `check`, or where there is no data."""
         devices = self.machine.num_devices * self.machine.num_machines
         self.check(devices)
         datamanager = self.pipeline.datamanager
@@ -161,21 +147,8 @@ class NrfgsTrainerConfig(TrainerConfig):
         if data is not None and not os.path.exists(data):
             raise InputError(f"--data {shown(str(data))}: no such file or folder. Check the path.")
         if devices > 1:
-            resolve_name(f"{SEVERAL_DEVICES}.launch:prepare")(self)
-        self._check_tracker()
+            resolve_name("nrfgs_ns.distributed.launch:prepare")(self)
         CONSOLE.print(f"{self.method_name} on {data or _absolute(parser.data)}", **PLAIN)
-
-    def _check_tracker(self) -> None:
-        """Raise InputError where wandb or comet is missing or lacks a key: nerfstudio starts them when the photographs
-        are read. At a terminal wandb asks for its key."""
-        try:
-            if self.is_wandb_enabled():
-                resolve_name("wandb").login()
-            elif self.is_comet_enabled() and not resolve_name("comet_ml").get_config("comet.api_key"):
-                raise ValueError("No API key")
-        except Exception as error:  # each has its own
-            fix = "Install it by pip and log in (`wandb login`, `comet login`), or give --vis tensorboard."
-            raise InputError(f"vis is {self.vis}, which cannot start: {str(error).rstrip('.')}. {fix}") from error
 
     def save_config(self) -> None:
         """Make the training's folder and save config.yml there, with absolute paths; InputError where that fails."""

@@ -34,7 +34,7 @@ def work_of(optimizers) -> list:
     for optimizer in optimizers:
         for state in optimizer.state.values():
             state["step"] += 1
-    return [(o.param_groups[0], o.param_groups[0]["params"], list(o.state.values())) for o in optimizers]
+    return [(o.param_groups[0], *next(iter(o.state.items()))) for o in optimizers]
 
 
 def numbers_of(optimizer) -> list[torch.Tensor]:

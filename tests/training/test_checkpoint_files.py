@@ -157,7 +157,8 @@ def scene(names=("a.png", "b.png", "c.png"), shift: float = 0.0, **lens: float) 
     poses[:, 0, 3] = torch.arange(len(names))
     poses[1, 1, 3] += shift
     lenses = {name: torch.full((len(names), 1), value) for name, value in (LENS | lens).items()}
-    return data_set_of(list(names), SimpleNamespace(camera_to_worlds=poses, **lenses))
+    cameras = SimpleNamespace(camera_to_worlds=poses, **lenses)
+    return data_set_of(SimpleNamespace(image_filenames=names, cameras=cameras))
 
 
 @pytest.mark.parametrize(("here", "going_on", "afterwards"), [

@@ -5,10 +5,8 @@ import math
 import os
 import re
 import signal
-import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
@@ -194,21 +192,7 @@ def test_options_without_sense_are_refused(option, bad, tiny_scene):
         config.print_to_terminal()  # ns-train's first call: nothing is written before it
 
 
-@pytest.mark.parametrize(("vis", "package"), [("wandb", "wandb"), ("viewer+comet", "comet_ml")])
-def test_a_tracker_that_would_not_start_is_told_first(vis, package, tiny_scene, monkeypatch):
-    without_key = SimpleNamespace(login=Mock(side_effect=ValueError("No API key")), get_config=lambda _: None)
-    for module, finding in ((None, f"import of {package}"), (without_key, "No API key")):
-        monkeypatch.setitem(sys.modules, package, module)
-        with pytest.raises(InputError, match=rf"vis is {re.escape(vis)}.*{finding}.*by pip and log in"):
-            replace(config_with("vis", vis), data=tiny_scene).print_to_terminal()
-
-
-def test_a_folder_beyond_the_systems_encoding_and_images_too_small_to_begin_with_are_refused(tiny_scene, tmp_path):
-    config = parse(command_line("nrfgs", tiny_scene, tmp_path / os.fsdecode(b"caf\xe9"), STEPS))
-    with pytest.raises(InputError, match="beyond this system's encoding. Set PYTHONUTF8=1"):
-        config.print_to_terminal()
-    with pytest.raises(InputError, match="1 x 1 pixels.*--pipeline.model.num-downscales"):
-        ready(tiny_scene, tmp_path, {"--pipeline.model.num-downscales": 5})
+def test_a_scale_that_leaves_no_image_is_refused(tiny_scene, tmp_path):
     with pytest.raises(InputError, match="0.01 leaves nothing"):
         ready(tiny_scene, tmp_path, {"--pipeline.datamanager.camera-res-scale-factor": 0.01})
 
@@ -306,7 +290,7 @@ def test_only_a_second_ctrl_c_stops_at_once(second, seconds, ends, monkeypatch):
     now, ended = [5.0], []
     monkeypatch.setattr(stopping, "monotonic", lambda: now[0])
     monkeypatch.setattr(os, "_exit", ended.append)
-    request = StopRequest(quiet=True)
+    request = StopRequest()
     request.hear(signal.SIGINT)
     now[0] += seconds
     request.hear(second)

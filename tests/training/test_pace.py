@@ -29,7 +29,6 @@ def walk(budget, cost, phases=None):
     pace = TimedPace(LENGTH, budget, phases, lambda: now)
     pace.start()
     while not pace.is_spent:
-        pace.begin_step()
         positions.append(pace.position)
         now += cost(pace.position, len(positions))
         pace.advance()
@@ -81,11 +80,10 @@ def test_beyond_the_schedules_the_clock_says_how_many_steps_are_left():
     pace.load_state({"length": LENGTH, "rate": 100.0, "position": float(LENGTH), "seconds": 10.0})
     pace.start()
     while not pace.is_spent:
-        pace.begin_step()
         now += 0.1
         pace.advance()
         left.append(pace.steps_left)
-    assert left[1:] == [*range(98, -1, -1)]
+    assert left == [*range(99, -1, -1)]
 
 
 def test_steps_of_positions():
