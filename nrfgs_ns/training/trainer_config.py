@@ -148,7 +148,20 @@ class NrfgsTrainerConfig(TrainerConfig):
             raise InputError(f"--data {shown(str(data))}: no such file or folder. Check the path.")
         if devices > 1:
             resolve_name("nrfgs_ns.distributed.launch:prepare")(self)
+        self._check_tracker()
         CONSOLE.print(f"{self.method_name} on {data or _absolute(parser.data)}", **PLAIN)
+
+    def _check_tracker(self) -> None:
+        """Raise InputError where wandb or comet is missing or lacks a key: nerfstudio starts them when the photographs
+        are read. At a terminal wandb asks for its key."""
+        try:
+            if self.is_wandb_enabled():
+                resolve_name("wandb").login()
+            elif self.is_comet_enabled() and not resolve_name("comet_ml").get_config("comet.api_key"):
+                raise ValueError("No API key")
+        except Exception as error:  # each has its own
+            fix = "Install it by pip and log in (`wandb login`, `comet login`), or give --vis tensorboard."
+            raise InputError(f"vis is {self.vis}, which cannot start: {str(error).rstrip('.')}. {fix}") from error
 
     def save_config(self) -> None:
         """Make the training's folder and save config.yml there, with absolute paths; InputError where that fails."""
