@@ -63,12 +63,7 @@ def colmap():
 
 
 def extract_features(
-    database: Path,
-    photos: Path,
-    cameras: list[list[str]],
-    advance: Advance,
-    camera_model: CameraModel,
-    features: int,
+    database: Path, photos: Path, cameras: list[list[str]], advance: Advance, camera_model: CameraModel, features: int
 ) -> None:
     """Find at most `features` SIFT features in every photograph, on the CPU; each of `cameras` is a list of photographs
     that share their intrinsics. InputError where the disk lacks room for what follows: COLMAP would abort the whole
@@ -222,7 +217,7 @@ def _map_incrementally(database: Path, photos: Path, folder: Path, advance: Adva
             initial_image_pair_callback=lambda: advance(2),
             next_image_callback=lambda: advance(1),
         )
-    return [model for model in models.values() if model.num_reg_images() >= SMALLEST_MODEL]
+    return list(models.values())
 
 
 def _map_globally(database: Path, photos: Path, folder: Path) -> list[Any]:
@@ -231,7 +226,6 @@ def _map_globally(database: Path, photos: Path, folder: Path) -> list[Any]:
     options = pycolmap.GlobalPipelineOptions(min_model_size=SMALLEST_MODEL, random_seed=SEED)
     with tempfile.TemporaryDirectory(dir=folder.parent) as attempts:
         models = list(pycolmap.global_mapping(database, photos, attempts, options=options).values())
-        models = [model for model in models if model.num_reg_images() >= SMALLEST_MODEL]
         for model in models:
             pycolmap.triangulate_points(model, database, photos, attempts)
             pycolmap.bundle_adjustment(model, pycolmap.BundleAdjustmentOptions(print_summary=False))

@@ -56,12 +56,12 @@ FAR = 100.0
 lose less than a hundredth of a pixel, and stay to the bit where nerfstudio puts them."""
 
 
-def read_cameras(meta: dict[str, Any], source: Path, config: Any) -> tuple[Cameras, np.ndarray, Tensor, float]:
+def read_cameras(meta: dict[str, Any], source: Path, config: Any) -> tuple[Cameras, Tensor, float]:
     """The cameras of a transforms.json in full size, oriented, centred and scaled as a parser's options say.
 
     Returns:
-        The cameras [V]; their intrinsics by `read_lenses`; the transform [3, 4] from the frames' world to the cameras',
-        before scaling; and the scale, also of what was applied before.
+        The cameras [V]; the transform [3, 4] from the frames' world to the cameras', before scaling; and the scale,
+        also of what was applied before.
     """
     frames = meta["frames"]
     lenses = read_lenses(meta, source)
@@ -74,7 +74,7 @@ def read_cameras(meta: dict[str, Any], source: Path, config: Any) -> tuple[Camer
         raise InputError(f"{source}: orientation_override is {shown(repr(orientation))}. {fix}")
     placed, transform, scale = place(poses, orientation, config.center_method, scaled, config.scale_factor)
     scale *= number(meta.get("applied_scale", 1.0))
-    return cameras_of(meta, lenses, placed, source), lenses, transform, scale
+    return cameras_of(meta, lenses, placed, source), transform, scale
 
 
 def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -> np.ndarray:
@@ -238,18 +238,15 @@ def _check_model(meta: dict[str, Any], source: Path) -> None:
 def cameras_of(meta: dict[str, Any], lenses: np.ndarray, poses: Tensor, source: Path) -> Cameras:
     """The cameras in full size, of `read_lenses` and poses [V, 3, 4]; InputError if undistorting leaves too little."""
     kind = CAMERA_MODEL_TO_TYPE[meta.get("camera_model", "OPENCV")]
-    table = torch.from_numpy(lenses)
-    fx, fy, cx, cy = table[:, :4].float().unbind(1)
-    width, height = table[:, 4:6].int().unbind(1)
-    distortion = table[:, len(PIXELS) :].float()
     if kind == CameraType.FISHEYE:
-        distortion[(distortion == 0).all(dim=1), 0] = FISHEYE_AT_LEAST
-    full = np.column_stack([lenses[:, :4], width, height, distortion])
-    for lens, index in zip(*np.unique(full, axis=0, return_index=True), strict=True):
-        if lens[6:].any():
+        lenses[(lenses[:, len(PIXELS) :] == 0).all(axis=1), len(PIXELS)] = FISHEYE_AT_LEAST
+    for lens, index in zip(*np.unique(lenses, axis=0, return_index=True), strict=True):
+        if lens[len(PIXELS) :].any():
             name = shown(meta["frames"][index]["file_path"])
             _check_distortion(lens, kind, f"{source}: the distortion of {name}")
-    return Cameras(poses, fx, fy, cx, cy, width, height, distortion, kind, metadata={})
+    fx, fy, cx, cy, width, height = torch.from_numpy(lenses[:, : len(PIXELS)]).float().unbind(1)
+    distortion = torch.from_numpy(lenses[:, len(PIXELS) :]).float()
+    return Cameras(poses, fx, fy, cx, cy, width.int(), height.int(), distortion, kind, metadata={})
 
 
 def undistorted_cameras(lenses: Cameras) -> Cameras:

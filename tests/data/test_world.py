@@ -84,16 +84,6 @@ def test_views_without_a_point_are_named_and_most_views_must_have_some(tmp_path,
         capture.parse(eval_mode="all")
 
 
-@pytest.mark.parametrize("spread", [0.0, 0.01])
-def test_points_of_hardly_any_spread_start_nothing(tmp_path, spread):
-    capture, xyz = with_points(tmp_path / "scene")
-    capture.add_ply(np.concatenate([(5, 6, 7) + spread * (xyz[:30] - (5, 6, 7)), xyz[30:]]))
-    with pytest.raises(InputError, match=r"transforms.json: the 40 points to start from .*--load-3D-points False"):
-        capture.parse()
-    capture.add_ply((5, 6, 7) + 0.1 * (xyz - (5, 6, 7)))
-    assert len(capture.parse().metadata["points3D_xyz"]) == 40
-
-
 def test_empty_masks_are_named(tmp_path, printed):
     capture = Capture(tmp_path / "scene", images=10)
     capture.add_masks()
