@@ -28,7 +28,7 @@ from nrfgs_prepare import photos as files
 from nrfgs_prepare.pairs import Advance
 from nrfgs_prepare.structure import CameraModel
 
-STAGES = ("import", "features", "pairs", "match", "map", "write")
+STAGES = ("import", "features", "match", "map", "write")
 GOOD_SHARE = 0.9
 """Share of the photographs that a good reconstruction places."""
 GOOD_ERROR = 1.5
@@ -103,7 +103,6 @@ class Run:
         """Run every stage, and print the verdict."""
         self.import_input()
         self.find_features()
-        self.choose_pairs()
         self.match()
         self.map()
         self.write()
@@ -120,8 +119,6 @@ class Run:
             read = partial(files.import_video, self.inputs[0], self.stored, frames)
             self.stage("import", "read the video", self.stored, frames, read, frames=frames)
             return
-        if others := files.left_out(self.options.photos, self.inputs):
-            self.screen.print(others, markup=False, soft_wrap=True)
         count = len(self.inputs)
         if count < files.FEW:
             warning = f"Warning: {count} photographs are few. Take 30 or more that overlap for a better scene."
@@ -136,10 +133,10 @@ class Run:
         find = partial(structure.extract_features, self.database, self.stored, cameras, **chosen)
         self.stage("features", "find features", self.database.parent, len(names), find, cameras=cameras, **chosen)
 
-    def choose_pairs(self) -> None:
+    def match(self) -> None:
         names, matching = self.names, self.options.matching
 
-        def choose(advance: Advance) -> None:
+        def match(advance: Advance) -> None:
             if matching == "exhaustive":
                 chosen = list(itertools.combinations(range(len(names)), 2))
             else:
@@ -147,21 +144,18 @@ class Run:
                 positions = pairs.metres(structure.positions(self.database, names))
                 in_a_row = self.is_video or pairs.numbered_in_a_row(names)
                 chosen = pairs.likely_pairs(pairs.shared_features(descriptors, advance), positions, in_a_row)
-            self.state["chosen"] = chosen
+            self.state["pairs"] = len(chosen)
 
-        self.stage("pairs", "choose pairs", None, len(names), choose, matching=matching)
+            def matched(count: int) -> None:
+                advance(count * len(names) / len(chosen))  # as long as the choice, on the bar
 
-    def match(self) -> None:
-        names, chosen = self.names, self.state["chosen"]
-
-        def match(advance: Advance) -> None:
-            if structure.match_features(self.database, names, chosen, self.work, advance) == 0:
+            if structure.match_features(self.database, names, chosen, self.work, matched) == 0:
                 raise InputError(
                     f"{self.options.photos}: no two of the {len(names)} photographs show the same thing. Take them "
                     "closer to each other, with texture in view, and sharp; or try --features 8192."
                 )
 
-        self.stage("match", "match pairs", None, len(chosen), match)
+        self.stage("match", "match the photographs", None, 2 * len(names), match, matching=matching)
 
     def map(self) -> None:
         def find(advance: Advance) -> None:
@@ -207,7 +201,7 @@ class Run:
         for later in STAGES[STAGES.index(slot) + 1 :]:
             self.state.pop(later, None)
         self.state[slot] = {"key": self.key, "done": done}
-        write_whole(self.state_file, json.dumps(self.state) + "\n")
+        write_whole(self.state_file, json.dumps(self.state, indent=1) + "\n")
 
     def verdict(self) -> None:
         """Print results and the next step, and write the numbers to OUT/prepare.json."""
@@ -224,7 +218,7 @@ class Run:
             "mean_track_length": model.compute_mean_track_length(),
             "models": self.state["models"],
             "mapping": self.state["mapping"],
-            "pairs": len(self.state["chosen"]),
+            "pairs": self.state["pairs"],
             "options": {name: value for name, value in asdict(self.options).items() if name not in ("photos", "out")},
         }
         write_whole(self.verdict_file, json.dumps(numbers, indent=1) + "\n")

@@ -55,18 +55,10 @@ def find_inputs(source: Path) -> list[Path]:
     if len(photos) < FEWEST:
         raise InputError(
             f"{source} directly holds {len(photos)} photographs ({', '.join(PHOTOS)}); at least {FEWEST} are needed, "
-            "better 30 or more, from different places, each seeing most of what the one before it sees. "
-            f"{left_out(source, photos)}"
+            "better 30 or more, from different places, each seeing most of what the one before it sees. To use a "
+            "video, name that file itself."
         )
     return photos
-
-
-def left_out(source: Path, photos: list[Path]) -> str:
-    """A sentence about other contents of a folder, by suffix; "" without any."""
-    others = [path for path in source.iterdir() if not path.name.startswith(".") and path not in set(photos)]
-    kinds = {"folders" if path.is_dir() else path.suffix.lower() or "no suffix" for path in others}
-    hint = "To use a video, name that file itself." if kinds & set(VIDEOS) else ""
-    return f"Left out, since they are not read here: {', '.join(sorted(kinds))}. {hint}" if kinds else ""
 
 
 def digest(paths: list[Path]) -> str:

@@ -35,7 +35,6 @@ def write_scene(distorted: Path, photos: Path, undistorted: Path, out: Path, adv
     for folder in ("images", *(f"images_{factor}" for factor in DOWNSCALES)):
         shutil.rmtree(out / folder, ignore_errors=True)
         (out / folder).mkdir(parents=True)
-    taken = {image.name: read_exif(photos / image.name) for image in images}
     for image in images:
         picture = read_picture(undistorted / "images" / image.name)
         for factor in DOWNSCALES:
@@ -44,10 +43,10 @@ def write_scene(distorted: Path, photos: Path, undistorted: Path, out: Path, adv
         os.replace(undistorted / "images" / image.name, out / "images" / image.name)
         advance(1)
     model.export_PLY(out / "sparse.ply")
-    write_whole(out / "transforms.json", json.dumps(_transforms(model, images, taken), indent=1) + "\n")
+    write_whole(out / "transforms.json", json.dumps(_transforms(model, images, photos), indent=1) + "\n")
 
 
-def _transforms(model: Any, images: list[Any], taken: dict[str, dict[str, float | str]]) -> dict[str, Any]:
+def _transforms(model: Any, images: list[Any], photos: Path) -> dict[str, Any]:
     """The content of transforms.json for images sorted by name; intrinsics that all share are at the top level."""
     cameras = [_intrinsics(model.cameras[image.camera_id]) for image in images]
     shared = cameras[0] if all(camera == cameras[0] for camera in cameras) else {}
@@ -66,7 +65,7 @@ def _transforms(model: Any, images: list[Any], taken: dict[str, dict[str, float 
             {
                 "file_path": name,
                 **({} if shared else camera),
-                **({"exif": taken[image.name]} if taken[image.name] else {}),
+                **({"exif": exif} if (exif := read_exif(photos / image.name)) else {}),
                 "transform_matrix": _camera_to_world(image).tolist(),
             }
             for name, camera, image in zip(names, cameras, images, strict=True)
