@@ -132,7 +132,7 @@ def positions(database: Path, names: list[str]) -> np.ndarray:
 def match_features(
     database: Path, names: list[str], pairs: Pairs, folder: Path, advance: Advance, ratio: float = RATIO
 ) -> int:
-    """Match and verify pairs of photographs, and return the number of verified ones."""
+    """Match pairs of photographs, and return the number of verified matches."""
     pycolmap = colmap()
     matching = pycolmap.FeatureMatchingOptions()
     matching.sift.max_ratio = ratio
@@ -148,8 +148,7 @@ def match_features(
         )
         advance(len(part))
     with pycolmap.Database.open(database) as opened:
-        _, inliers = opened.read_two_view_geometry_num_inliers()
-        return sum(number > 0 for number in inliers)
+        return opened.num_inlier_matches()
 
 
 def find_cameras(

@@ -65,7 +65,6 @@ def read_cameras(meta: dict[str, Any], source: Path, config: Any) -> tuple[Camer
     """
     frames = meta["frames"]
     lenses = read_lenses(meta, source)
-    check_applied(meta, source)
     scaled = config.auto_scale_poses and len(frames) > 1
     poses = check_poses(frames, source, need_spread=scaled)
     orientation = meta.get("orientation_override", config.orientation_method)
@@ -73,8 +72,7 @@ def read_cameras(meta: dict[str, Any], source: Path, config: Any) -> tuple[Camer
         fix = f"Use one of {', '.join(ORIENTATIONS)}, or remove it."
         raise InputError(f"{source}: orientation_override is {shown(repr(orientation))}. {fix}")
     placed, transform, scale = place(poses, orientation, config.center_method, scaled, config.scale_factor)
-    scale *= number(meta.get("applied_scale", 1.0))
-    return cameras_of(meta, lenses, placed, source), transform, scale
+    return cameras_of(meta, lenses, placed, source), transform, scale * applied_scale(meta, source)
 
 
 def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -> np.ndarray:
@@ -117,15 +115,20 @@ def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -
     return poses
 
 
-def check_applied(meta: dict[str, Any], source: Path) -> None:
-    """Check that applied_transform, if present, is a 3 x 4 matrix, and applied_scale a positive number."""
-    if "applied_transform" in meta:
-        applied = matrix(meta["applied_transform"])
-        if applied.shape != (3, 4) or not np.isfinite(applied).all():
-            raise InputError(f"{source}: applied_transform is not a 3 x 4 matrix of numbers. Correct or remove it.")
+def applied_scale(meta: dict[str, Any], source: Path) -> float:
+    """The scale that the poses already have."""
     scale = meta.get("applied_scale", 1.0)
     if not 0 < number(scale) < np.inf:
         raise InputError(f"{source}: applied_scale is {shown(repr(scale))}. Give a positive number or remove it.")
+    return number(scale)
+
+
+def applied_transform(meta: dict[str, Any], source: Path) -> Tensor:
+    """The transform that the poses already have, float64 [3, 4]."""
+    applied = matrix(meta["applied_transform"])
+    if applied.shape != (3, 4) or not np.isfinite(applied).all():
+        raise InputError(f"{source}: applied_transform is not a 3 x 4 matrix of numbers. Correct or remove it.")
+    return torch.from_numpy(applied)
 
 
 class PlacedOutputs(DataparserOutputs):

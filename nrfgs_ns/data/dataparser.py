@@ -20,7 +20,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from nrfgs_ns.data import checks
-from nrfgs_ns.data.cameras import SMALLEST, PlacedOutputs, after, read_cameras
+from nrfgs_ns.data.cameras import SMALLEST, PlacedOutputs, after, applied_transform, read_cameras
 from nrfgs_ns.data.checks import find_colmap, shown, warn
 from nrfgs_ns.data.pictures import known_exif, read_size
 from nrfgs_ns.data.points import check_sight, read_colmap, read_ply
@@ -132,7 +132,7 @@ class NrfgsDataParser(DataParser):
             self._check_sizes(meta["frames"], source, factor, full_sizes, sizes)
         to_frames = COLMAP_TO_FRAMES if self._colmap.exists() else None
         if "applied_transform" in meta:
-            to_frames = torch.tensor(np.array(meta["applied_transform"], dtype=np.float64))
+            to_frames = applied_transform(meta, source)
         return DataSet(meta, source, splits, factor, cameras, transform, to_frames, scale)
 
     def _factor(self, frames: list[dict[str, Any]], source: Path) -> int:
