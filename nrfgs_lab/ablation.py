@@ -180,7 +180,7 @@ def mean_log_distance(model, cameras) -> float:
     """Mean of log r over the training views, weighted by contribution; r in scene units, as the field sees it."""
     total, weight = 0.0, 0.0
     for index in range(len(cameras)):
-        view, _, share = look_through(model, model.field, cameras[index : index + 1])
+        view, _, share = look_through(model, cameras[index : index + 1])
         towards = view.center - model.field.splats["means"].index_select(0, view.visible)
         distance = (towards.norm(dim=-1) / model.head.scene_unit).clamp_min(1e-10)
         share = share.clamp_min(0.0).double()

@@ -22,7 +22,6 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from nrfgs_ns.data.pictures import read_size
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import write_whole
 from nrfgs_prepare import pairs, structure
@@ -30,7 +29,7 @@ from nrfgs_prepare import photos as files
 from nrfgs_prepare.pairs import Advance
 from nrfgs_prepare.structure import CameraModel
 
-STAGES = ("import", "features", "pairs", "match", "map", "undistort", "write")
+STAGES = ("import", "features", "match", "map", "write")
 GOOD_SHARE = 0.9
 """Share of the photographs that a good reconstruction places."""
 GOOD_ERROR = 1.5
@@ -52,11 +51,6 @@ class Prepare:
     exhaustive: all"""
     camera_model: CameraModel = "SIMPLE_RADIAL"
     """lens to fit; images are undistorted to a pinhole. OPENCV: for strong distortion and many photographs"""
-    camera: Literal["auto", "single", "per-image"] = "auto"
-    """single: one set of intrinsics for all photographs. auto: one for those of one size, model and focal
-    length"""
-    feature_size: int = 1600
-    """longest side of the images in which features are found, pixels; 10 or more"""
     features: int = 4096
     """largest number of features in a photograph, 10 or more; more give more points and take longer"""
     frames: int = 150
@@ -78,18 +72,16 @@ class Run:
     """One call of the command: its paths, and the state of the stages."""
 
     def __init__(self, options: Prepare, screen: Console | None = None):
-        for name in ("feature_size", "features", "frames"):
+        for name in ("features", "frames"):
             if getattr(options, name) < 10:
-                raise InputError(f"--{name.replace('_', '-')} is {getattr(options, name)}. Give at least 10.")
+                raise InputError(f"--{name} is {getattr(options, name)}. Give at least 10.")
         self.options, self.screen = options, screen or Console()
         self.inputs = files.find_inputs(options.photos)
         self.is_video = options.photos.is_file()
         structure.colmap()  # reports a missing package before any work
         self.out, self.work = options.out, options.out / "work"
-        self.stored, self.database, self.model, self.undistorted, self.pairs_file, self.state_file = (
-            self.work / name
-            for name in ("photos", "database.db", "model", "undistorted", "likely_pairs.json", "state.json")
-        )
+        names = "photos", "features/database.db", "model", "state.json"
+        self.stored, self.database, self.model, self.state_file = map(self.work.joinpath, names)
         self.verdict_file = self.out / "prepare.json"
         self.source = str(options.photos.resolve())
         ours = self.state_file.is_file() or self.verdict_file.is_file()
@@ -112,10 +104,8 @@ class Run:
         """Run every stage, and print the verdict."""
         self.import_input()
         self.find_features()
-        self.choose_pairs()
         self.match()
         self.map()
-        self.undistort()
         self.write()
         self.verdict()
 
@@ -128,7 +118,7 @@ class Run:
         if self.is_video:
             frames = self.options.frames
             read = partial(files.import_video, self.inputs[0], self.stored, frames)
-            self.stage("import", "read the video", [self.stored], frames, read, frames=frames)
+            self.stage("import", "read the video", self.stored, frames, read, frames=frames)
             return
         if others := files.left_out(self.options.photos, self.inputs):
             self.screen.print(others, markup=False, soft_wrap=True)
@@ -137,27 +127,19 @@ class Run:
             warning = f"Warning: {count} photographs are few. Take 30 or more that overlap for a better scene."
             self.screen.print(warning, style="bold yellow", soft_wrap=True)
         read = partial(files.import_photos, self.inputs, self.stored)
-        self.stage("import", "read the photographs", [self.stored], count, read)
+        self.stage("import", "read the photographs", self.stored, count, read)
 
     def find_features(self) -> None:
         names, options = self.names, self.options
-        if options.camera == "single" and (count := len({read_size(self.stored / name) for name in names})) > 1:
-            raise InputError(
-                f"--camera is single, but {options.photos} has photographs of {count} sizes. Leave it out."
-            )
-        cameras = files.same_cameras(self.stored, names) if options.camera == "auto" else [names]
-        if options.camera == "per-image":
-            cameras = [[name] for name in names]
-        chosen = {"camera_model": options.camera_model}
-        chosen |= {"longest_side": options.feature_size, "features": options.features}
-        database = [self.database, *(self.database.with_name(self.database.name + end) for end in ("-wal", "-shm"))]
+        cameras = files.same_cameras(self.stored, names)
+        chosen = {"camera_model": options.camera_model, "features": options.features}
         find = partial(structure.extract_features, self.database, self.stored, cameras, **chosen)
-        self.stage("features", "find features", database, len(names), find, cameras=cameras, **chosen)
+        self.stage("features", "find features", self.database.parent, len(names), find, cameras=cameras, **chosen)
 
-    def choose_pairs(self) -> None:
+    def match(self) -> None:
         names, matching = self.names, self.options.matching
 
-        def choose(advance: Advance) -> None:
+        def match(advance: Advance) -> None:
             if matching == "exhaustive":
                 chosen = list(itertools.combinations(range(len(names)), 2))
             else:
@@ -165,22 +147,18 @@ class Run:
                 positions = pairs.metres(structure.positions(self.database, names))
                 in_a_row = self.is_video or pairs.numbered_in_a_row(names)
                 chosen = pairs.likely_pairs(pairs.shared_features(descriptors, advance), positions, in_a_row)
-            write_whole(self.pairs_file, json.dumps(chosen) + "\n")
+            self.state["pairs"] = len(chosen)
 
-        self.stage("pairs", "choose pairs", [self.pairs_file], len(names), choose, matching=matching)
+            def matched(count: int) -> None:
+                advance(count * len(names) / len(chosen))  # as long as the choice, on the bar
 
-    def match(self) -> None:
-        names = self.names
-        chosen = [tuple(pair) for pair in json.loads(self.pairs_file.read_text())]
-
-        def match(advance: Advance) -> None:
-            if structure.match_features(self.database, names, chosen, self.work, advance) == 0:
+            if structure.match_features(self.database, names, chosen, self.work, matched) == 0:
                 raise InputError(
                     f"{self.options.photos}: no two of the {len(names)} photographs show the same thing. Take them "
                     "closer to each other, with texture in view, and sharp; or try --features 8192."
                 )
 
-        self.stage("match", "match pairs", [], len(chosen), match)
+        self.stage("match", "match the photographs", None, 2 * len(names), match, matching=matching)
 
     def map(self) -> None:
         def find(advance: Advance) -> None:
@@ -196,33 +174,25 @@ class Run:
                 )
             self.state |= {"models": models, "mapping": mapping}
 
-        self.stage("map", "find the cameras", [self.model], len(self.names), find)
-
-    def undistort(self) -> None:
-        undistort = partial(structure.undistort, self.model, self.stored, self.undistorted)
-        self.stage("undistort", "undistort", [self.undistorted], 1, undistort)
+        self.stage("map", "find the cameras", self.model, len(self.names), find)
 
     def write(self) -> None:
-        from nrfgs_prepare.scene import DOWNSCALES, write_scene
+        from nrfgs_prepare.scene import write_scene
 
-        folders = ["images", *(f"images_{factor}" for factor in DOWNSCALES)]
-        made = [self.out / name for name in ("transforms.json", "sparse.ply", *folders)]
-        registered = len(list((self.undistorted / "images").iterdir()))
-        write = partial(write_scene, self.undistorted, self.stored, self.out)
-        self.stage("write", "write the scene", made, registered, write)
+        write = partial(write_scene, self.model, self.stored, self.work / "undistorted", self.out)
+        self.stage("write", "write the scene", self.out / "transforms.json", len(self.names), write)
 
     def stage(
-        self, slot: str, name: str, made: list[Path], total: int, work: Callable[[Advance], None], **depends_on: Any
+        self, slot: str, name: str, made: Path | None, total: int, work: Callable[[Advance], None], **depends_on: Any
     ) -> None:
-        """Run a stage with a progress bar up to `total`, unless it is finished; its files `made` are removed first if
-        they are of another input or other options."""
+        """Run a stage with a progress bar up to `total`, unless it is finished; the file or folder that it makes is
+        removed first if it is of another input or other options."""
         self.key = hashlib.sha256(json.dumps([self.key, slot, depends_on], sort_keys=True).encode()).hexdigest()
         before = self.state.get(slot, {})
-        if before == {"key": self.key, "done": True} and all(path.exists() for path in made[:1]):
+        if before == {"key": self.key, "done": True} and (made is None or made.exists()):
             return
-        if before.get("key") != self.key:
-            for path in made:
-                shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+        if made is not None and before.get("key") != self.key:
+            shutil.rmtree(made) if made.is_dir() else made.unlink(missing_ok=True)
         self._remember(slot, done=False)
         clocks = time.monotonic, time.process_time
         begun = [clock() for clock in clocks]
@@ -255,7 +225,7 @@ class Run:
             "mean_track_length": model.compute_mean_track_length(),
             "models": self.state["models"],
             "mapping": self.state["mapping"],
-            "pairs": len(json.loads(self.pairs_file.read_text())),
+            "pairs": self.state["pairs"],
             "seconds_and_cpu_seconds": self.state["seconds"],
             "options": {name: value for name, value in asdict(self.options).items() if name not in ("photos", "out")},
         }
@@ -284,7 +254,7 @@ class Run:
                 yield "Try --matching exhaustive: slower, but it finds every overlap."
             yield "Try --features 8192, or take more photographs, sharp and with more overlap."
         if error > GOOD_ERROR:
-            yield "The error is large: try --camera-model OPENCV, or --camera per-image if the zoom was changed."
+            yield "The error is large: try --camera-model OPENCV."
         if shortest < SHORTEST:
             found = f"A focal length is {shortest:.2f} of the longer side, shorter than that of most lenses"
             yield f"{found}: the cameras are probably wrong. Keep the photographs' EXIF, or take more, from the sides."

@@ -23,7 +23,7 @@ LARGEST_GAP = 3
 AT_ONCE = 32
 """Photographs compared with one at once: bounds the memory."""
 
-Advance = Callable[[int], None]
+Advance = Callable[[float], None]
 """Called with the number of finished pieces of work."""
 Pairs = list[tuple[int, int]]
 """Sorted pairs of indices, first < second."""

@@ -14,21 +14,11 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
-from nrfgs_ns.data.pictures import (
-    HEIF,
-    NUMBERS,
-    check_depth,
-    exif_of,
-    is_heif,
-    naming,
-    open_picture,
-    read_exif,
-    read_size,
-)
+from nrfgs_ns.data.pictures import NUMBERS, check_depth, exif_of, is_heif, naming, open_picture, read_exif, read_size
 from nrfgs_ns.errors import InputError
 from nrfgs_prepare.pairs import Advance
 
-PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", *HEIF)
+PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif")
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 KEPT = {".jpg": ("JPEG", "MPO"), ".jpeg": ("JPEG", "MPO"), ".png": ("PNG",)}
 """Suffixes of files that are copied if they are what the suffix says; files with others become PNG."""
@@ -104,14 +94,11 @@ def stored_names(photos: list[Path]) -> list[str]:
 
 def import_photos(photos: list[Path], folder: Path, advance: Advance) -> None:
     """Copy photographs into a folder, turned upright by EXIF; InputError names a file that cannot be decoded."""
-    folder.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
     for path, name in zip(photos, stored_names(photos), strict=True):
-        target = folder / name
-        if not target.exists():
-            aside = folder.with_name("photo" + target.suffix)  # so that a cut copy is not taken for a whole one
-            with open_picture(path) as image:
-                _store(image, path, aside)
-            os.replace(aside, target)
+        with open_picture(path) as image:
+            _store(image, path, folder / name)
         advance(1)
 
 

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
-from plyfile import PlyData, PlyElement
 
 from nrfgs_ns.data.pictures import read_exif, read_picture
 from nrfgs_ns.data.views import interior_test_images
@@ -26,40 +25,28 @@ DOWNSCALES = (2, 4, 8)
 """Copies that nerfstudio looks for; it takes the largest with sides of at most 1600 pixels."""
 
 
-def write_scene(undistorted: Path, photos: Path, out: Path, advance: Advance) -> None:
-    """Write a scene from the undistorted images/, which are linked, and sparse/ of a COLMAP model, with the EXIF of
-    `photos` by the same names."""
+def write_scene(distorted: Path, photos: Path, undistorted: Path, out: Path, advance: Advance) -> None:
+    """Undistort the photographs of a COLMAP model, and write a scene from them, with the EXIF of `photos`."""
+    shutil.rmtree(undistorted, ignore_errors=True)
+    undistorted.mkdir(parents=True)
+    colmap().undistort_images(undistorted, distorted, photos, output_type="COLMAP", jpeg_quality=97)
     model = colmap().Reconstruction(undistorted / "sparse")
     images = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
     for folder in ("images", *(f"images_{factor}" for factor in DOWNSCALES)):
         shutil.rmtree(out / folder, ignore_errors=True)
         (out / folder).mkdir(parents=True)
-    taken = {image.name: read_exif(photos / image.name) for image in images}
     for image in images:
-        source = undistorted / "images" / image.name
-        picture = read_picture(source)
+        picture = read_picture(undistorted / "images" / image.name)
         for factor in DOWNSCALES:
             size = max(picture.width // factor, 1), max(picture.height // factor, 1)  # as nerfstudio rounds its cameras
             picture.resize(size, Image.Resampling.LANCZOS).save(out / f"images_{factor}" / image.name, quality=95)
-        try:
-            os.link(source, out / "images" / image.name)
-        except OSError:  # a file system without hard links
-            shutil.copyfile(source, out / "images" / image.name)
+        os.replace(undistorted / "images" / image.name, out / "images" / image.name)
         advance(1)
-    points = list(model.points3D.values())
-    xyz = np.array([point.xyz for point in points], dtype=np.float32).reshape(-1, 3)
-    rgb = np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
-    write_ply(out / "sparse.ply", xyz, rgb)
-    write_whole(out / "transforms.json", json.dumps(_transforms(model, images, taken), indent=1) + "\n")
+    model.export_PLY(out / "sparse.ply")
+    write_whole(out / "transforms.json", json.dumps(_transforms(model, images, photos), indent=1) + "\n")
 
 
-def write_ply(path: Path, xyz: np.ndarray, rgb: np.ndarray) -> None:
-    """Write a .ply of points [N, 3], stored as float32, with colours uint8 [N, 3]."""
-    columns = np.rec.fromarrays([*xyz.astype("<f4").T, *rgb.astype("u1").T], names="x,y,z,red,green,blue")
-    PlyData([PlyElement.describe(np.asarray(columns), "vertex")], byte_order="<").write(str(path))
-
-
-def _transforms(model: Any, images: list[Any], taken: dict[str, dict[str, float | str]]) -> dict[str, Any]:
+def _transforms(model: Any, images: list[Any], photos: Path) -> dict[str, Any]:
     """The content of transforms.json for images sorted by name; intrinsics that all share are at the top level."""
     cameras = [_intrinsics(model.cameras[image.camera_id]) for image in images]
     shared = cameras[0] if all(camera == cameras[0] for camera in cameras) else {}
@@ -78,7 +65,7 @@ def _transforms(model: Any, images: list[Any], taken: dict[str, dict[str, float 
             {
                 "file_path": name,
                 **({} if shared else camera),
-                **({"exif": taken[image.name]} if taken[image.name] else {}),
+                **({"exif": exif} if (exif := read_exif(photos / image.name)) else {}),
                 "transform_matrix": _camera_to_world(image).tolist(),
             }
             for name, camera, image in zip(names, cameras, images, strict=True)

@@ -8,18 +8,16 @@ import itertools
 import math
 import os
 import shutil
-import sqlite3
 import tempfile
 from collections import Counter
 from collections.abc import Callable
-from contextlib import closing
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from PIL import ExifTags
 
-from nrfgs_ns.data.pictures import exif_of, open_picture, read_picture, read_size, tag_number
+from nrfgs_ns.data.pictures import exif_of, open_picture, read_size, tag_number
 from nrfgs_ns.errors import InputError
 from nrfgs_prepare.pairs import Advance, Pairs
 
@@ -48,7 +46,8 @@ BYTES_PER_FEATURE = 300
 """Room for a feature and its matches in the database."""
 BYTES_PER_PIXEL = 1.0
 """Room for an undistorted photograph: JPEG of its quality takes up to 0.8."""
-CUT = "was not written whole: the disk may be full. Make room, and run this again."
+LONGEST_SIDE = 1600
+"""Longest side of the images in which features are found, pixels."""
 
 
 def colmap():
@@ -65,22 +64,21 @@ def colmap():
 
 
 def extract_features(
-    database: Path,
-    photos: Path,
-    cameras: list[list[str]],
-    advance: Advance,
-    camera_model: CameraModel,
-    longest_side: int,
-    features: int,
+    database: Path, photos: Path, cameras: list[list[str]], advance: Advance, camera_model: CameraModel, features: int
 ) -> None:
-    """Find at most `features` SIFT features in every photograph, shrunk to `longest_side` pixels, on the CPU; each of
-    `cameras` is a list of photographs that share their intrinsics. InputError where the disk lacks room."""
+    """Find at most `features` SIFT features in every photograph, on the CPU; each of `cameras` is a list of photographs
+    that share their intrinsics. InputError where the disk lacks room for what follows: COLMAP would abort the whole
+    process, or say nothing."""
     pycolmap = colmap()
+    database.parent.mkdir(exist_ok=True)
     every = list(itertools.chain(*cameras))
     kept = database.stat().st_size if database.exists() else 0  # of an interrupted run
-    needed = BYTES_PER_FEATURE * features * len(every) - kept
-    _check_room(database.parent, needed, "features", "Make room, or give a smaller --features.")
-    options = pycolmap.FeatureExtractionOptions(max_image_size=longest_side)
+    pixels = sum(math.prod(read_size(photos / name)) for name in every)
+    needed = BYTES_PER_FEATURE * features * len(every) + BYTES_PER_PIXEL * pixels - kept
+    if needed > (free := shutil.disk_usage(database.parent).free):
+        finding = f"the work may take {needed / 1e6:.1f} MB, and {free / 1e6:.1f} MB are free"
+        raise InputError(f"{database.parent}: {finding}. Make room, or give a smaller --features.")
+    options = pycolmap.FeatureExtractionOptions(max_image_size=LONGEST_SIDE)
     options.sift.max_num_features = features
     reader = pycolmap.ImageReaderOptions(camera_model=camera_model)
     batch = max(os.cpu_count() or 1, 4)
@@ -89,7 +87,7 @@ def extract_features(
         for first in range(0, len(names), batch):
             part = names[first : first + batch]
             sizes = [read_size(photos / name) for name in part]
-            searched = min(w * h * min(1.0, longest_side / max(w, h)) ** 2 for w, h in sizes)
+            searched = min(w * h * min(1.0, LONGEST_SIDE / max(w, h)) ** 2 for w, h in sizes)
             options.sift.first_octave = 0 if searched >= LARGE else -1  # -1: the photograph is doubled first
             if names is not alone:  # each call would make a camera of its own
                 with pycolmap.Database.open(database) as opened:
@@ -106,13 +104,6 @@ def extract_features(
             )
             advance(len(part))
     _scale_focal_lengths(database, photos, every)
-
-
-def _check_room(folder: Path, needed: float, what: str, fix: str) -> None:
-    """Raise InputError where the disk lacks room: COLMAP would abort the whole process."""
-    free = shutil.disk_usage(folder).free
-    if free < needed:
-        raise InputError(f"{folder}: {what} may take {needed / 1e6:.1f} MB, and {free / 1e6:.1f} MB are free. {fix}")
 
 
 def _scale_focal_lengths(database: Path, photos: Path, names: list[str]) -> None:
@@ -168,7 +159,7 @@ def positions(database: Path, names: list[str]) -> np.ndarray:
 def match_features(
     database: Path, names: list[str], pairs: Pairs, folder: Path, advance: Advance, ratio: float = RATIO
 ) -> int:
-    """Match and verify pairs of photographs, and return the number of verified ones."""
+    """Match pairs of photographs, and return the number of verified matches."""
     pycolmap = colmap()
     matching = pycolmap.FeatureMatchingOptions()
     matching.sift.max_ratio = ratio
@@ -184,8 +175,7 @@ def match_features(
         )
         advance(len(part))
     with pycolmap.Database.open(database) as opened:
-        _, inliers = opened.read_two_view_geometry_num_inliers()
-        return sum(number > 0 for number in inliers)
+        return opened.num_inlier_matches()
 
 
 def find_cameras(
@@ -218,40 +208,20 @@ def find_cameras(
         if _size(others)[0] > _size(models)[0]:
             models, mapping = others, "global"
     if models:
-        write_model(max(models, key=lambda model: _size([model])), folder)
+        folder.mkdir(parents=True)
+        max(models, key=lambda model: _size([model])).write(folder)
     return len(models), mapping
 
 
 def _match_more(database: Path, names: list[str], place: Path) -> Path:
     """A copy of the database in which all pairs are matched, with doubtful matches, too."""
-    copy = place / database.name
-    _check_room(place, 2 * database.stat().st_size, "further matches", "Make room, and run this again.")
-    with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(copy)) as target:
-        source.backup(target)
+    copy = Path(shutil.copy(database, place))
     with colmap().Database.open(copy) as opened:
         opened.clear_matches()
         opened.clear_two_view_geometries()
     pairs = list(itertools.combinations(range(len(names)), 2))
     match_features(copy, names, pairs, place, lambda _: None, DOUBTFUL)
     return copy
-
-
-def write_model(model: Any, folder: Path) -> None:
-    """Write a reconstruction into a new folder; InputError if that fails, which COLMAP does not report."""
-    folder.mkdir(parents=True)
-    model.write(folder)
-    _check_model(folder, model)
-
-
-def _check_model(folder: Path, model: Any) -> None:
-    from nrfgs_ns.data.colmap import read_model, read_points  # slow to import; pycolmap reads beyond a file's end
-
-    try:
-        written = len(read_model(folder)[1]), len(read_points(folder)[0])
-    except InputError:
-        written = None
-    if written != _size([model]):
-        raise InputError(f"{folder} {CUT}")
 
 
 def _size(models: list[Any]) -> tuple[int, int]:
@@ -273,7 +243,7 @@ def _map_incrementally(database: Path, photos: Path, folder: Path, advance: Adva
             initial_image_pair_callback=lambda: advance(2),
             next_image_callback=lambda: advance(1),
         )
-    return [model for model in models.values() if model.num_reg_images() >= SMALLEST_MODEL]
+    return list(models.values())
 
 
 def _map_globally(database: Path, photos: Path, folder: Path) -> list[Any]:
@@ -282,16 +252,9 @@ def _map_globally(database: Path, photos: Path, folder: Path) -> list[Any]:
     options = pycolmap.GlobalPipelineOptions(min_model_size=SMALLEST_MODEL, random_seed=SEED)
     with tempfile.TemporaryDirectory(dir=folder.parent) as attempts:
         models = list(pycolmap.global_mapping(database, photos, attempts, options=options).values())
-        models = [model for model in models if model.num_reg_images() >= SMALLEST_MODEL]
         for model in models:
             pycolmap.triangulate_points(model, database, photos, attempts)
-            everything = pycolmap.BundleAdjustmentConfig()
-            for image in model.reg_image_ids():
-                everything.add_image(image)
-            everything.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-            options = pycolmap.BundleAdjustmentOptions(print_summary=False)
-            pycolmap.create_default_bundle_adjuster(options, everything, model).solve()
-            model.update_point_3d_errors()
+            pycolmap.bundle_adjustment(model, pycolmap.BundleAdjustmentOptions(print_summary=False))
     return [model for model in models if model.num_points3D() >= FEWEST_POINTS * model.num_reg_images()]
 
 
@@ -323,40 +286,16 @@ def _explained_matches(model: Any, database: Path) -> dict[tuple[int, int], tupl
     with pycolmap.Database.open(database) as opened:
         for number, image in images.items():
             keypoints = np.asarray(opened.read_keypoints(number), dtype=np.float64)[:, :2]
-            rays[number] = np.pad(image.camera.cam_from_img(keypoints), ((0, 0), (0, 1)), constant_values=1.0)
+            rays[number] = image.camera.cam_from_img(keypoints)
         for pair, geometry in zip(*opened.read_two_view_geometries(), strict=True):
             first, second = numbers = pycolmap.pair_id_to_image_pair(pair)
             matches = np.asarray(geometry.inlier_matches).reshape(-1, 2)
             if first not in images or second not in images or len(matches) == 0:
                 continue
             a, b = images[first], images[second]
-            relative = b.cam_from_world() * a.cam_from_world().inverse()
-            essential = np.cross(relative.translation, relative.rotation.matrix(), axisb=0).T  # [t]x R
+            essential = pycolmap.essential_matrix_from_pose(b.cam_from_world() * a.cam_from_world().inverse())
             x, y = rays[first][matches[:, 0]], rays[second][matches[:, 1]]
-            lines, back = x @ essential.T, y @ essential
             focal = (a.camera.mean_focal_length() + b.camera.mean_focal_length()) / 2
-            slope = np.linalg.norm(np.hstack([lines[:, :2], back[:, :2]]), axis=1)  # 0 where both are at one place
-            close = focal * np.abs((lines * y).sum(axis=1)) <= tolerance * slope
-            pairs[tuple(numbers)] = len(matches), int(close.sum())
+            squares = np.array(pycolmap.compute_squared_sampson_error(x, y, essential))
+            pairs[tuple(numbers)] = len(matches), int((squares <= (tolerance / focal) ** 2).sum())
     return pairs
-
-
-def undistort(model: Path, photos: Path, folder: Path, advance: Advance) -> None:
-    """Write undistorted photographs to folder/images and their pinhole model to folder/sparse; InputError if that
-    fails, which COLMAP does not report."""
-    pycolmap = colmap()
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    distorted = pycolmap.Reconstruction(model)
-    names = [distorted.images[number].name for number in distorted.reg_image_ids()]
-    needed = BYTES_PER_PIXEL * sum(math.prod(read_size(photos / name)) for name in names)
-    _check_room(folder, needed, "undistorted photographs", "Make room, and run this again.")
-    pycolmap.undistort_images(folder, model, photos, output_type="COLMAP", jpeg_quality=97)
-    _check_model(folder / "sparse", distorted)
-    for name in names:
-        path = folder / "images" / name
-        try:
-            read_picture(path)
-        except InputError as error:
-            raise InputError(f"{path} {CUT}") from error
-    advance(1)

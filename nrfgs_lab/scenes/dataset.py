@@ -94,9 +94,15 @@ def _sees(scene: Scene, camera: Array, points: Array) -> Array:
     return inside & (np.linalg.norm(hits - points, axis=1) < SEEN_TOLERANCE)
 
 
-def _write_files(scene: Scene, folder: Path, advance: Callable[[], object]) -> None:
-    from nrfgs_prepare.scene import write_ply  # for work alone
+def write_ply(path: Path, xyz: np.ndarray, rgb: np.ndarray) -> None:
+    """Write a .ply of points [N, 3], stored as float32, with colours uint8 [N, 3]."""
+    from plyfile import PlyData, PlyElement  # for work alone
 
+    columns = np.rec.fromarrays([*xyz.astype("<f4").T, *rgb.astype("u1").T], names="x,y,z,red,green,blue")
+    PlyData([PlyElement.describe(np.asarray(columns), "vertex")], byte_order="<").write(str(path))
+
+
+def _write_files(scene: Scene, folder: Path, advance: Callable[[], object]) -> None:
     config = scene.config
     cameras = dome_cameras(config)
     train, test = split_names(config)

@@ -26,9 +26,9 @@ import tyro
 from PIL import Image
 
 from nrfgs_lab.bench.spec import QUIET
+from nrfgs_lab.scenes.dataset import write_ply
 from nrfgs_lab.training_run import machine, parse
 from nrfgs_ns.files import write_whole
-from nrfgs_prepare.scene import write_ply
 
 CAPTURES = {
     "30 of 12 megapixels": (30, 4000, 3000, ""),

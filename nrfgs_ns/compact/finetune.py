@@ -234,7 +234,7 @@ def contributions_to(model, cameras: Cameras) -> Tensor:
     """Contribution of each splat of a model to its views: alpha T, summed over pixels and views. [N]"""
     total = torch.zeros(model.num_points, dtype=torch.float64, device=model.device)
     for index in range(len(cameras)):
-        view, _, share = look_through(model, model.field, cameras[index : index + 1])
+        view, _, share = look_through(model, cameras[index : index + 1])
         total.index_add_(0, view.visible, share.clamp_min(0.0).double())
     return total.float()
 

@@ -56,16 +56,15 @@ FAR = 100.0
 lose less than a hundredth of a pixel, and stay to the bit where nerfstudio puts them."""
 
 
-def read_cameras(meta: dict[str, Any], source: Path, config: Any) -> tuple[Cameras, np.ndarray, Tensor, float]:
+def read_cameras(meta: dict[str, Any], source: Path, config: Any) -> tuple[Cameras, Tensor, float]:
     """The cameras of a transforms.json in full size, oriented, centred and scaled as a parser's options say.
 
     Returns:
-        The cameras [V]; their intrinsics by `read_lenses`; the transform [3, 4] from the frames' world to the cameras',
-        before scaling; and the scale, also of what was applied before.
+        The cameras [V]; the transform [3, 4] from the frames' world to the cameras', before scaling; and the scale,
+        also of what was applied before.
     """
     frames = meta["frames"]
     lenses = read_lenses(meta, source)
-    check_applied(meta, source)
     scaled = config.auto_scale_poses and len(frames) > 1
     poses = check_poses(frames, source, need_spread=scaled)
     orientation = meta.get("orientation_override", config.orientation_method)
@@ -73,8 +72,7 @@ def read_cameras(meta: dict[str, Any], source: Path, config: Any) -> tuple[Camer
         fix = f"Use one of {', '.join(ORIENTATIONS)}, or remove it."
         raise InputError(f"{source}: orientation_override is {shown(repr(orientation))}. {fix}")
     placed, transform, scale = place(poses, orientation, config.center_method, scaled, config.scale_factor)
-    scale *= number(meta.get("applied_scale", 1.0))
-    return cameras_of(meta, lenses, placed, source), lenses, transform, scale
+    return cameras_of(meta, lenses, placed, source), transform, scale * applied_scale(meta, source)
 
 
 def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -> np.ndarray:
@@ -117,15 +115,20 @@ def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -
     return poses
 
 
-def check_applied(meta: dict[str, Any], source: Path) -> None:
-    """Check that applied_transform, if present, is a 3 x 4 matrix, and applied_scale a positive number."""
-    if "applied_transform" in meta:
-        applied = matrix(meta["applied_transform"])
-        if applied.shape != (3, 4) or not np.isfinite(applied).all():
-            raise InputError(f"{source}: applied_transform is not a 3 x 4 matrix of numbers. Correct or remove it.")
+def applied_scale(meta: dict[str, Any], source: Path) -> float:
+    """The scale that the poses already have."""
     scale = meta.get("applied_scale", 1.0)
     if not 0 < number(scale) < np.inf:
         raise InputError(f"{source}: applied_scale is {shown(repr(scale))}. Give a positive number or remove it.")
+    return number(scale)
+
+
+def applied_transform(meta: dict[str, Any], source: Path) -> Tensor:
+    """The transform that the poses already have, float64 [3, 4]."""
+    applied = matrix(meta["applied_transform"])
+    if applied.shape != (3, 4) or not np.isfinite(applied).all():
+        raise InputError(f"{source}: applied_transform is not a 3 x 4 matrix of numbers. Correct or remove it.")
+    return torch.from_numpy(applied)
 
 
 class PlacedOutputs(DataparserOutputs):
@@ -238,18 +241,15 @@ def _check_model(meta: dict[str, Any], source: Path) -> None:
 def cameras_of(meta: dict[str, Any], lenses: np.ndarray, poses: Tensor, source: Path) -> Cameras:
     """The cameras in full size, of `read_lenses` and poses [V, 3, 4]; InputError if undistorting leaves too little."""
     kind = CAMERA_MODEL_TO_TYPE[meta.get("camera_model", "OPENCV")]
-    table = torch.from_numpy(lenses)
-    fx, fy, cx, cy = table[:, :4].float().unbind(1)
-    width, height = table[:, 4:6].int().unbind(1)
-    distortion = table[:, len(PIXELS) :].float()
     if kind == CameraType.FISHEYE:
-        distortion[(distortion == 0).all(dim=1), 0] = FISHEYE_AT_LEAST
-    full = np.column_stack([lenses[:, :4], width, height, distortion])
-    for lens, index in zip(*np.unique(full, axis=0, return_index=True), strict=True):
-        if lens[6:].any():
+        lenses[(lenses[:, len(PIXELS) :] == 0).all(axis=1), len(PIXELS)] = FISHEYE_AT_LEAST
+    for lens, index in zip(*np.unique(lenses, axis=0, return_index=True), strict=True):
+        if lens[len(PIXELS) :].any():
             name = shown(meta["frames"][index]["file_path"])
             _check_distortion(lens, kind, f"{source}: the distortion of {name}")
-    return Cameras(poses, fx, fy, cx, cy, width, height, distortion, kind, metadata={})
+    fx, fy, cx, cy, width, height = torch.from_numpy(lenses[:, : len(PIXELS)]).float().unbind(1)
+    distortion = torch.from_numpy(lenses[:, len(PIXELS) :]).float()
+    return Cameras(poses, fx, fy, cx, cy, width.int(), height.int(), distortion, kind, metadata={})
 
 
 def undistorted_cameras(lenses: Cameras) -> Cameras:

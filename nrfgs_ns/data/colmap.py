@@ -11,27 +11,12 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
-from nerfstudio.data.utils.colmap_parsing_utils import (
-    qvec2rotmat,
-    read_cameras_binary,
-    read_cameras_text,
-    read_points3D_text,
-)
+from nerfstudio.data.utils import colmap_parsing_utils as nerfstudio_colmap
+from nerfstudio.process_data.colmap_utils import parse_colmap_camera_params
 
 from nrfgs_ns.data.checks import find_colmap, shown
 from nrfgs_ns.errors import InputError
 
-MODELS = {
-    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
-    "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
-    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
-    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
-    "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
-    "OPENCV_FISHEYE": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"),
-    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
-    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
-}
-"""Camera models that can be undistorted, and their parameters as transforms.json names them."""
 QUATERNION_TOLERANCE = 1e-2
 """Largest difference of a rotation quaternion's length from 1."""
 EXPORT = "Export the COLMAP model again."
@@ -51,8 +36,8 @@ def read_model(folder: Path) -> tuple[dict[int, dict[str, Any]], list[Photograph
     """Cameras by id (camera_model, w, h and parameters, named as in transforms.json), photographs in the order of their
     ids, and the file of the photographs; InputError also where a camera model cannot be undistorted."""
     path = _file(folder, "cameras")
-    stored = _read(read_cameras_text if path.suffix == ".txt" else read_cameras_binary, path)
-    cameras = {id: _lens(camera, path) for id, camera in stored.items()}
+    read = nerfstudio_colmap.read_cameras_text if path.suffix == ".txt" else nerfstudio_colmap.read_cameras_binary
+    cameras = {id: _lens(camera, path) for id, camera in _read(read, path).items()}
     path = path.with_stem("images")
     photographs = _read(_images_text, path) if path.suffix == ".txt" else _read(_entries, path, _image)
     photographs.sort(key=lambda photograph: photograph.id)
@@ -65,7 +50,7 @@ def read_points(folder: Path) -> tuple[np.ndarray, np.ndarray, Path]:
     """Positions and colours, float64 [N, 3] each, of points3D.bin or points3D.txt, and the file."""
     path = _file(folder, "points3D")
     if path.suffix == ".txt":
-        rows = [(*point.xyz, *point.rgb) for point in _read(read_points3D_text, path).values()]
+        rows = [(*point.xyz, *point.rgb) for point in _read(nerfstudio_colmap.read_points3D_text, path).values()]
     else:
         rows = _read(_entries, path, _point)
     table = np.array(rows, dtype=np.float64).reshape(-1, 6)
@@ -91,17 +76,13 @@ def _read(read: Callable[..., Any], path: Path, *rest: Any) -> Any:
 
 
 def _lens(camera: Any, path: Path) -> dict[str, Any]:
-    names = MODELS.get(camera.model, ())
-    if len(camera.params) != len(names):
+    try:
+        return parse_colmap_camera_params(camera)
+    except (NotImplementedError, IndexError, ValueError) as error:
         raise InputError(
             f"{path}: a camera of model {shown(camera.model)} with {len(camera.params)} parameters is not supported. "
-            f"Undistort the photographs (colmap image_undistorter), or use one of {', '.join(MODELS)}."
-        )
-    lens = dict(zip(names, map(float, camera.params), strict=True))
-    if "f" in lens:
-        lens["fl_x"] = lens["fl_y"] = lens.pop("f")
-    kind = "OPENCV_FISHEYE" if "FISHEYE" in camera.model else "OPENCV"
-    return {"camera_model": kind, "w": camera.width, "h": camera.height, **lens}
+            "Undistort the photographs (colmap image_undistorter), or use OPENCV or OPENCV_FISHEYE."
+        ) from error
 
 
 def _photograph(id: int, pose: Sequence[float], camera: int, name: str) -> Photograph:
@@ -110,7 +91,7 @@ def _photograph(id: int, pose: Sequence[float], camera: int, name: str) -> Photo
     if not (abs(np.linalg.norm(quaternion) - 1) <= QUATERNION_TOLERANCE and np.isfinite(position).all()):
         raise ValueError(f"the pose of {name} holds NaN or Inf, or a quaternion that is not of length 1")
     world_to_camera = np.eye(4)
-    world_to_camera[:3, :3] = qvec2rotmat(quaternion)
+    world_to_camera[:3, :3] = nerfstudio_colmap.qvec2rotmat(quaternion)
     world_to_camera[:3, 3] = position
     return Photograph(id, name, camera, world_to_camera)
 

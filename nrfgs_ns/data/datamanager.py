@@ -8,7 +8,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from traceback import walk_tb
 from typing import Any, Literal
 
 import numpy as np
@@ -32,7 +31,7 @@ from torch import Tensor
 from nrfgs_ns.data.cameras import LENS, undistorted_cameras
 from nrfgs_ns.data.checks import some, warn
 from nrfgs_ns.data.colmap_parser import checked
-from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
+from nrfgs_ns.data.dataparser import NrfgsDataParser, NrfgsDataParserConfig
 from nrfgs_ns.data.pictures import cache_folder, free_memory, in_parallel, read_mask, read_picture
 from nrfgs_ns.data.views import different_views, nearest_depth, scene_unit
 from nrfgs_ns.errors import InputError
@@ -138,8 +137,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         try:
             super().__init__(config, *args, **kwargs)
         except (OSError, LookupError, AttributeError, AssertionError, TypeError, ValueError) as error:
-            calls = [frame.f_globals["__name__"] for frame, _ in walk_tb(error.__traceback__)]
-            if not isinstance(error, OSError) and any(name.startswith("nrfgs_ns.") for name in calls[1:]):
+            if not isinstance(error, OSError) and issubclass(config.dataparser._target, NrfgsDataParser):
                 raise  # only nerfstudio's own parsers raise these for a user's mistake
             finding = f"cannot be read ({type(error).__name__}: {' '.join(str(error).split())})"
             fix = "Check the path in --data or config.yml, and what kind of data set it is."

@@ -9,7 +9,6 @@ import os
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from shlex import quote
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -21,11 +20,10 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
 from nrfgs_ns.data import checks
-from nrfgs_ns.data.cameras import SMALLEST, PlacedOutputs, after, read_cameras
+from nrfgs_ns.data.cameras import SMALLEST, PlacedOutputs, after, applied_transform, read_cameras
 from nrfgs_ns.data.checks import find_colmap, shown, warn
-from nrfgs_ns.data.pictures import read_size, stored_exif
-from nrfgs_ns.data.points import read_colmap, read_ply
-from nrfgs_ns.data.sight import check_sight, in_reach
+from nrfgs_ns.data.pictures import known_exif, read_size
+from nrfgs_ns.data.points import check_sight, in_reach, read_colmap, read_ply
 from nrfgs_ns.data.splits import SPLITS, STAND_INS, Named, Rows, split_by_names, split_by_rule
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.start import with_data_parsers
@@ -34,8 +32,6 @@ with_data_parsers()
 
 LONGEST_JSON = 2**26
 """Largest transforms.json, bytes: a hundred thousand frames."""
-PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".heic", ".dng")
-"""Suffixes of a camera's files."""
 MIN_POINTS = 4
 """Fewer points cannot start a training: a splat's first size is its distance to its three nearest neighbours."""
 FOLDERS = {"file_path": "images", "mask_path": "masks"}
@@ -68,8 +64,6 @@ class DataSet(NamedTuple):
     """rows of each split"""
     factor: int
     """size by the intrinsics / size of the images"""
-    lenses: np.ndarray
-    """`cameras.read_lenses`, float64 [V, 12]"""
     cameras: Cameras
     """placed, of the size of the images"""
     transform: torch.Tensor
@@ -100,10 +94,6 @@ class NrfgsDataParser(DataParser):
         frames = [data_set.meta["frames"][row] for row in rows]
         images, masks = (self._files(frames, key, data_set.factor) for key in FOLDERS)
         cameras = data_set.cameras[torch.from_numpy(rows)]
-        if self.downscale_factor is None:
-            self._check_sizes(data_set, rows, "file_path", images, cameras)
-            if masks:
-                self._check_sizes(data_set, rows, "mask_path", masks, cameras)
         copies = all(self._has_copies(key, data_set.factor) for key in FOLDERS if key in frames[0])
         corner = torch.full((3,), self.config.scene_scale)
         outputs = PlacedOutputs(
@@ -114,7 +104,7 @@ class NrfgsDataParser(DataParser):
             dataparser_scale=data_set.scale,
             dataparser_transform=after(data_set.transform, data_set.to_frames),
             metadata={
-                "exif": [stored_exif(frame, data_set.source) for frame in frames],
+                "exif": [known_exif(frame.get("exif", {})) for frame in frames],
                 "factor": data_set.factor,
                 "downscale": 1 if copies else data_set.factor,
             },
@@ -125,21 +115,25 @@ class NrfgsDataParser(DataParser):
 
     @cached_property
     def _data_set(self) -> DataSet:
-        """The whole data set, checked as far as can be done without opening all images."""
+        """The whole data set, checked as far as can be done without decoding images."""
         config = self.config
         checks.check_options(config)
         meta, source = self._read()
-        cameras, lenses, transform, scale = read_cameras(meta, source, config)
+        cameras, transform, scale = read_cameras(meta, source, config)
         factor = self._factor(meta["frames"], source) if self.downscale_factor is None else self.downscale_factor
         splits = self._splits(meta, source)
+        full_sizes = torch.cat([cameras.width, cameras.height], dim=1).tolist()
         rounding = getattr(config, "downscale_rounding_mode", "floor")
         cameras.rescale_output_resolution(scaling_factor=1.0 / factor, scale_rounding_mode=rounding)
         if (side := int(min(cameras.width.min(), cameras.height.min()))) < SMALLEST:
             raise InputError(f"{source}: --downscale-factor {factor} leaves {side} pixels a side. Give a smaller one.")
+        if self.downscale_factor is None:
+            sizes = torch.cat([cameras.width, cameras.height], dim=1).tolist()
+            self._check_sizes(meta["frames"], source, factor, full_sizes, sizes)
         to_frames = COLMAP_TO_FRAMES if self._colmap.exists() else None
         if "applied_transform" in meta:
-            to_frames = torch.tensor(np.array(meta["applied_transform"], dtype=np.float64))
-        return DataSet(meta, source, splits, factor, lenses, cameras, transform, to_frames, scale)
+            to_frames = applied_transform(meta, source)
+        return DataSet(meta, source, splits, factor, cameras, transform, to_frames, scale)
 
     def _factor(self, frames: list[dict[str, Any]], source: Path) -> int:
         """The downscale factor, given or by the images' size; InputError if a file is missing at that size."""
@@ -197,32 +191,32 @@ class NrfgsDataParser(DataParser):
         root = self._root(key)
         return root.with_name(f"{root.name}_{factor}")
 
-    def _check_sizes(self, data_set: DataSet, rows: np.ndarray, key: str, paths: list[Path], cameras: Cameras) -> None:
-        """Check that images or masks have the size of their cameras, or the full one without smaller copies."""
-        kind = FOLDERS[key]
-        if self._has_copies(key, data_set.factor):
-            checks.check_unique(paths, f"{data_set.source}: frames")
-            folder = self._copies(key, data_set.factor)
-            fix = f"Remove {folder}, or with `colmap` give --downscale-rounding-mode round or ceil."
-            checks.check_headers(paths, torch.cat([cameras.width, cameras.height], dim=1).tolist(), kind, fix)
-        else:
-            fix = "Use the images of the poses, or scale w, h, fl_x, fl_y, cx and cy with them; masks are as large."
-            checks.check_headers(paths, data_set.lenses[rows, 4:6].astype(int), kind, fix)
+    def _check_sizes(
+        self, frames: list[dict[str, Any]], source: Path, factor: int, full_sizes: list[Any], sizes: list[Any]
+    ) -> None:
+        """Check that images and masks have the size of their cameras, or the full one without smaller copies."""
+        for key, kind in FOLDERS.items():
+            if not (paths := self._files(frames, key, factor)):
+                continue
+            if self._has_copies(key, factor):
+                checks.check_unique(paths, f"{source}: frames")
+                folder = self._copies(key, factor)
+                fix = f"Remove {folder}, or with `colmap` give --downscale-rounding-mode round or ceil."
+                checks.check_headers(paths, sizes, kind, fix)
+            else:
+                fix = "Use the images of the poses, or scale w, h, fl_x, fl_y, cx and cy with them; masks are as large."
+                checks.check_headers(paths, full_sizes, kind, fix)
 
     @cached_property
     def _placed_points(self) -> dict[str, torch.Tensor]:
         """points3D_xyz float32 [N, 3] and points3D_rgb uint8 [N, 3] in the cameras' world; if too few, a warning."""
         data_set = self._data_set
-        points = self._points(data_set)
-        count = 0 if points is None else len(points[0])
-        if count < MIN_POINTS:
-            finding = "the data set has no point cloud (no ply_file_path, no colmap/sparse/0)"
-            if points is not None:
-                finding = f"the point cloud holds {count} usable points, fewer than {MIN_POINTS}"
+        xyz, rgb, transform = self._points(data_set)
+        if len(xyz) < MIN_POINTS:
+            finding = f"there are {len(xyz)} usable points (of ply_file_path, or in colmap/sparse/0)"
             warn(f"{data_set.source}: {finding}. Training starts from random points, which costs quality.")
             return {}
-        xyz, rgb = (torch.from_numpy(table) for table in points[:2])
-        transform = points[2].double()
+        xyz, rgb, transform = torch.from_numpy(xyz), torch.from_numpy(rgb), transform.double()
         xyz = data_set.scale * (xyz @ transform[:, :3].T + transform[:, 3])
         near = torch.from_numpy(in_reach(xyz.numpy(), data_set.cameras, data_set.source))
         xyz, rgb = xyz[near].float(), rgb[near]
@@ -268,13 +262,13 @@ class NrfgsDataParser(DataParser):
         fields = {split: f"{split}_filenames" for split in SPLITS}
         return {split: (name, meta[name]) for split, name in fields.items() if name in meta}
 
-    def _points(self, data_set: DataSet) -> tuple[np.ndarray, np.ndarray, torch.Tensor] | None:
-        """Positions and colours [N, 3] as stored, and the transform [3, 4] to the cameras' unscaled world; or None."""
+    def _points(self, data_set: DataSet) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
+        """Positions and colours [N, 3] as stored, and the transform [3, 4] to the cameras' unscaled world."""
         if "ply_file_path" in data_set.meta:
             return *read_ply(self._file(str(data_set.meta["ply_file_path"]))), data_set.transform
         if self._colmap.is_dir():
             return *read_colmap(self._colmap), after(data_set.transform, data_set.to_frames)
-        return None
+        return *np.empty((2, 0, 3)), data_set.transform
 
 
 def read_transforms(data: Path) -> tuple[dict[str, Any], Path]:
@@ -297,14 +291,12 @@ def read_transforms(data: Path) -> tuple[dict[str, Any], Path]:
 
 
 def _advice_without_transforms(folder: Path) -> str:
-    if folder.is_dir():
-        if model := find_colmap(folder):
-            return f"There is a COLMAP model: put `colmap --colmap-path {model}` at the end of the command."
-        if (folder / "transforms_train.json").exists():
-            return "There is one for each split: put `blender-data` at the end of the command."
-        if any(file.suffix.lower() in PHOTOGRAPHS for pattern in ("*", "images/*") for file in folder.glob(pattern)):
-            return f"For photographs without poses run `nrfgs prepare {quote(str(folder))} SCENE`, and train on SCENE."
-    return "Point --data at a folder that holds one; `nrfgs prepare PHOTOS SCENE` makes one from photographs."
+    if folder.is_dir() and (model := find_colmap(folder)):
+        return f"There is a COLMAP model: put `colmap --colmap-path {model}` at the end of the command."
+    return (
+        "Point --data at a folder that holds one; `nrfgs prepare PHOTOS SCENE` makes one from photographs. Where there "
+        "is a transforms_train.json, put `blender-data` at the end of the command."
+    )
 
 
 nrfgs_dataparser = DataParserSpecification(

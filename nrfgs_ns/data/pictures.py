@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+import psutil
 from PIL import ExifTags, Image
 from rich.progress import track
 
@@ -108,12 +109,8 @@ def read_mask(path: Path) -> Image.Image:
 
 
 def free_memory() -> float:
-    """Bytes of available memory; infinite where the system does not say."""
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        return next(1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
-    except (OSError, StopIteration, ValueError):
-        return math.inf
+    """Bytes of available memory."""
+    return psutil.virtual_memory().available
 
 
 def in_parallel(
@@ -168,15 +165,10 @@ def read_exif(path: Path) -> dict[str, float | str]:
     return {name: value for name, value in values.items() if value}
 
 
-def stored_exif(frame: dict[str, Any], source: Path) -> dict[str, Any]:
-    """The same from a frame's "exif" in transforms.json, as `nrfgs prepare` writes it; InputError for another type."""
-    stored = frame.get("exif", {})
-    numbers = [stored.get(name, 1.0) for name in NUMBERS] if isinstance(stored, dict) else [None]
-    good = all(isinstance(value, int | float) and 0 < value < math.inf for value in numbers)
-    if not good or not isinstance(stored.get("model", ""), str):
-        where = f'{source}: "exif" of {frame.get("file_path")}'
-        raise InputError(f"{where} must hold numbers above 0 ({', '.join(NUMBERS)}) and model. Correct or remove it.")
-    return stored
+def known_exif(stored: Any) -> dict[str, float]:
+    """The numbers of a frame's "exif" in transforms.json, as `nrfgs prepare` writes it."""
+    values = {name: tag_number(stored.get(name)) for name in NUMBERS} if isinstance(stored, dict) else {}
+    return {name: value for name, value in values.items() if value}
 
 
 def exif_of(image: Image.Image) -> Image.Exif:
@@ -196,6 +188,6 @@ def tag_number(value: Any) -> float | None:
     """A tag's (first) value if it is a finite number above 0."""
     try:
         number = float(value[0] if isinstance(value, tuple) else value)
-    except (TypeError, ValueError, IndexError, ZeroDivisionError):
+    except (TypeError, ValueError, IndexError, ArithmeticError):
         return None
     return number if math.isfinite(number) and number > 0 else None

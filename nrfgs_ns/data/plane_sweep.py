@@ -170,7 +170,8 @@ def sweep(views: Views, grey: Tensor, one: int, others: Tensor, planes: Tensor) 
         means = _window_mean(torch.cat([other, other * other, other * own], dim=1))
         spread = (means[:, 1:2] - means[:, :1] ** 2).clamp_min(0.0)
         correlation = (means[:, 2:] - means[:, :1] * mean) / (spread * variance + 1e-8).sqrt()
-        volume.append(_mean_of_largest(torch.where(usable, correlation[:, 0], -1.0), decisive))
+        best_first = torch.where(usable, correlation[:, 0], -1.0).sort(dim=0, descending=True).values
+        volume.append(best_first[:decisive].mean(dim=0))
     table = torch.stack(volume)
     best, index = table.max(dim=0)
     inner = index.clamp(1, len(planes) - 2)
@@ -250,26 +251,9 @@ def _transfer(views: Views, one: int, others: Tensor) -> tuple[Tensor, Tensor]:
     return intrinsics @ relative[:, :3, :3], (intrinsics @ relative[:, :3, 3:])[..., 0]
 
 
-def _mean_of_largest(rows: Tensor, count: int) -> Tensor:
-    """Mean of the `count` largest along the first, short dimension: exchanges of rows, on a CPU quicker than `topk`."""
-    sorted_rows = list(rows)
-    for first in range(count):
-        for at in range(len(sorted_rows) - 1, first, -1):
-            one, other = sorted_rows[at - 1 : at + 1]
-            sorted_rows[at - 1 : at + 1] = torch.maximum(one, other), torch.minimum(one, other)
-    return torch.stack(sorted_rows[:count]).mean(dim=0)
-
-
 def _window_mean(images: Tensor) -> Tensor:
-    """Means over windows [N, C, H, W] that end at image edges: shifted sums, on a CPU quicker than `avg_pool2d`."""
-    half = WINDOW // 2
-    for padding, dim in (((half, half), -1), ((0, 0, half, half), -2)):
-        size = images.shape[dim]
-        padded = F.pad(images, padding)
-        at = torch.arange(size, device=images.device)
-        images = padded.narrow(dim, 0, size).clone()
-        for shift in range(1, WINDOW):
-            images += padded.narrow(dim, shift, size)
-        inside = ((at + half).clamp_max(size - 1) - (at - half).clamp_min(0) + 1).to(images.dtype)
-        images /= inside if dim == -1 else inside[:, None]
+    """Means over windows [N, C, H, W] that end at image edges."""
+    for size in ((1, WINDOW), (WINDOW, 1)):
+        padding = size[0] // 2, size[1] // 2
+        images = F.avg_pool2d(images, size, stride=1, padding=padding, count_include_pad=False)
     return images

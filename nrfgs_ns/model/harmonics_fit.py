@@ -31,7 +31,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from nrfgs_ns.appearance.head import Field, SplatAppearance, base_colors
+from nrfgs_ns.appearance.head import SplatAppearance, base_colors
 from nrfgs_ns.appearance.sh import num_bases, sh_bases
 from nrfgs_ns.progress import progress
 from nrfgs_ns.rasterizer import View, contributions
@@ -216,7 +216,7 @@ def choose_strength(kept: Moments, held_out: Moments) -> float:
 def observe(model, camera: Cameras) -> Observations:
     """The visible splats of one training view."""
     field = model.field
-    view, appearance, weights = look_through(model, field, camera)
+    view, appearance, weights = look_through(model, camera)
     towards = field.splats["means"].index_select(0, view.visible) - view.center
     return Observations(
         rows=view.visible,
@@ -227,14 +227,14 @@ def observe(model, camera: Cameras) -> Observations:
     )
 
 
-def look_through(model, field: Field, camera: Cameras) -> tuple[View, SplatAppearance, Tensor]:
+def look_through(model, camera: Cameras) -> tuple[View, SplatAppearance, Tensor]:
     """The M splats that a training view sees, their appearance, and their contributions to the picture, [M].
 
     Args:
         camera: a batch of one, [1]; halved as by `no_larger`.
     """
-    view = model.project(no_larger(camera.to(model.device)), field.splats)
-    appearance = field.seen_from(view)
+    view = model.project(no_larger(camera.to(model.device)))
+    appearance = model.field.seen_from(view)
     return view, appearance, contributions(view.projection, appearance.opacities)
 
 

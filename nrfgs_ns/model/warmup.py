@@ -7,7 +7,6 @@ Only the head's shared weights learn. A head whose output layers start at zero h
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.utils.rich_utils import CONSOLE
 
 from nrfgs_ns.errors import InputError
 
@@ -15,7 +14,7 @@ LEARNING_RATE = 1e-3
 
 
 def warm_up(model, cameras: Cameras, steps: int) -> None:
-    """Teach `model.head` to be neutral, and log the result.
+    """Teach `model.head` to be neutral.
 
     Args:
         model: an NrfgsModel in training mode.
@@ -29,19 +28,15 @@ def warm_up(model, cameras: Cameras, steps: int) -> None:
     if not weights:
         return
     optimizer = torch.optim.Adam(weights, lr=LEARNING_RATE, eps=1e-15)
-    residuals = []  # root mean square in each step
     for step in range(steps):
         index = step % len(cameras)
         with torch.no_grad():
             view = model.project(cameras[index : index + 1].to(model.device))
         loss = model.head.neutral_loss(model.field.splats, view.visible, view.center)
-        if loss is None:
+        if loss is None or loss.item() == 0.0:  # the head adds nothing from the start
             return
         if len(view.visible) == 0:
             continue
-        residuals.append(loss.item() ** 0.5)
-        if residuals[-1] == 0.0:  # the head adds nothing from the start
-            return
         if not model.warms_up:
             fix = "Use one, or --pipeline.model.warmup-steps 0."
             raise InputError(f"The head starts with a residual, and is warmed up on one device only. {fix}")
@@ -49,6 +44,3 @@ def warm_up(model, cameras: Cameras, steps: int) -> None:
             weight.grad = gradient
         optimizer.step()
     optimizer.zero_grad(set_to_none=True)
-    if residuals:
-        change = f"from {residuals[0]:.2g} to {residuals[-1]:.2g}"
-        CONSOLE.log(f"Warm-up: {steps} steps took the residuals' root mean square {change}.")

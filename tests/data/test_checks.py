@@ -43,10 +43,6 @@ BROKEN = {  # what is done to the data set -> what the message must say
         lambda c: c.meta.update(train_filenames=[LAST], test_filenames=["images/x.png"]),
         "test_filenames x.png no frame",
     ),
-    "exif without sense": (
-        lambda c: c.meta["frames"][3].update(exif={"iso": float("inf")}),
-        "transforms.json exif 006.png numbers above 0 remove",
-    ),
     "one mask lacking": (lambda c: c.meta["frames"][4].pop("mask_path"), "mask_path images/005.png all-white for none"),
     "image missing": (lambda c: (c.folder / LAST).unlink(), "1 of 10 images missing 000.png Restore"),
     "image of another size": (

@@ -9,7 +9,7 @@ from small_capture import Capture, listing
 from small_colmap import Model
 
 from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
-from nrfgs_ns.data.pictures import read_exif
+from nrfgs_ns.data.pictures import known_exif, read_exif
 from nrfgs_ns.errors import InputError
 from nrfgs_prepare.photos import exif_of_copy
 
@@ -84,6 +84,8 @@ def test_a_photograph_says_how_it_was_taken_and_what_is_no_number_is_left_out(tm
     Image.new("RGB", (8, 6)).save(tmp_path / "b.png")
     (tmp_path / "c.jpg").write_bytes(b"junk")
     assert read_exif(tmp_path / "b.png") == read_exif(tmp_path / "c.jpg") == read_exif(tmp_path / "none") == {}
+    assert known_exif({"iso": 50, "f_number": float("inf"), "exposure_time": 10**400}) == {"iso": 50.0}
+    assert known_exif("junk") == {}
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png"])

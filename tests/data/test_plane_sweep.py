@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from torch.nn.functional import avg_pool2d
 
 from nrfgs_ns.data import plane_sweep as sweep
 from nrfgs_ns.model.initial_splats import start_with_dense_points
@@ -109,16 +108,3 @@ def test_a_training_starts_with_them_if_asked_to():
         model.config = SimpleNamespace(**config)
         start_with_dense_points(model, datamanager)
         assert len(started) == 1
-
-
-def test_the_quick_means_are_torchs():
-    """To the bit: the points that a training starts from do not change."""
-    draw = torch.Generator().manual_seed(0)
-    images, rows = torch.rand(3, 2, 19, 23, generator=draw), torch.rand(6, 50, generator=draw)
-    window = images
-    for size in ((1, sweep.WINDOW), (sweep.WINDOW, 1)):
-        padding = size[0] // 2, size[1] // 2
-        window = avg_pool2d(window, size, stride=1, padding=padding, count_include_pad=False)
-    assert torch.equal(sweep._window_mean(images), window)
-    for count in (1, 3, 6):
-        assert torch.equal(sweep._mean_of_largest(rows, count), rows.topk(count, dim=0).values.mean(dim=0))

@@ -73,7 +73,7 @@ def test_positions_are_laid_out_in_metres(tmp_path):
         exif.get_ifd(ExifTags.IFD.GPSInfo).update(values)
         Image.effect_noise((160, 120), 64).convert("RGB").save(tmp_path / name, exif=exif.tobytes())
     database = tmp_path / "database.db"
-    structure.extract_features(database, tmp_path, [list(tags)], lambda _: None, "SIMPLE_RADIAL", 1600, 100)
+    structure.extract_features(database, tmp_path, [list(tags)], lambda _: None, "SIMPLE_RADIAL", 100)
     place = np.array([55 + 41 / 60 + 53.4 / 3600, 13 + 11 / 60 + 43.4 / 3600])
     np.testing.assert_allclose(structure.positions(database, list(tags)), [place, -place, [np.nan] * 2, [np.nan] * 2])
 

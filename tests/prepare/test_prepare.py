@@ -21,6 +21,7 @@ from nrfgs_ns.data.points import read_ply
 from nrfgs_ns.errors import InputError
 from nrfgs_prepare import photos, structure
 from nrfgs_prepare.command import Prepare, Run
+from nrfgs_prepare.scene import write_scene
 
 pytest.importorskip("pycolmap")
 
@@ -156,7 +157,7 @@ def test_points_are_where_the_cameras_see_them(prepared):
 def test_finished_work_is_not_repeated_and_changes_are_noticed(prepared, walls, three, tmp_path, monkeypatch):
     out = shutil.copytree(prepared, tmp_path / "scene")
     source = shutil.copytree(walls, tmp_path / "photos")
-    for name in ("extract_features", "match_features", "find_cameras", "undistort"):
+    for name in ("extract_features", "match_features", "find_cameras"):
         monkeypatch.setattr(structure, name, Mock(side_effect=TypeError))
     said = run_quietly(source, out)
     assert "6 of 6 photographs" in said and "ns-train nrfgs" in said and "Without a camera" not in said
@@ -304,7 +305,7 @@ def test_what_is_refused_before_any_work(three, tmp_path, monkeypatch):
 @pytest.mark.parametrize(("file", "content", "said"), [
     ("state.json", "[1, 2]", "state.json is damaged"),
     ("state.json", "{", "state.json is damaged"),
-    ("database.db", "no database", "COLMAP stops with"),
+    ("features/database.db", "no database", "COLMAP stops with"),
 ])  # fmt: skip
 def test_damaged_work_is_told_in_one_sentence(prepared, walls, tmp_path, file, content, said):
     out = shutil.copytree(prepared, tmp_path / "scene")
@@ -316,30 +317,18 @@ def test_damaged_work_is_told_in_one_sentence(prepared, walls, tmp_path, file, c
     Run(Prepare(walls, out))  # as the message says
 
 
-def test_what_colmap_could_not_write_whole_is_not_built_on(prepared, tmp_path, monkeypatch):
+def test_an_undistorted_photograph_that_colmap_could_not_write_whole_is_not_built_on(prepared, tmp_path, monkeypatch):
     """As on a disk that is full, of which COLMAP says nothing."""
-    work, pycolmap = prepared / "work", structure.colmap()
-    model, undistort = pycolmap.Reconstruction(work / "model"), pycolmap.undistort_images
+    work, undistort = prepared / "work", structure.colmap().undistort_images
 
-    def cut(path: Path) -> None:
+    def cut_one(folder: Path, *args, **options) -> None:
+        undistort(folder, *args, **options)
+        path = folder / "images" / "IMG_00.png"
         path.write_bytes(path.read_bytes()[:20_000])
 
-    broken = Mock(wraps=model)
-    broken.write.side_effect = lambda folder: (model.write(folder), cut(folder / "points3D.bin"))
-    with pytest.raises(InputError, match="model was not written whole: the disk may be full"):
-        structure.write_model(broken, tmp_path / "model")
-    for name, found in (("images/IMG_00.png", "IMG_00.png"), ("sparse/points3D.bin", "sparse")):
-
-        def cut_one(folder: Path, *args, name=name, **options) -> None:
-            undistort(folder, *args, **options)
-            cut(folder / name)
-
-        monkeypatch.setattr(pycolmap, "undistort_images", cut_one)
-        with pytest.raises(InputError, match=f"{found} was not written whole"):
-            structure.undistort(work / "model", work / "photos", tmp_path / "cut", lambda steps: None)
-    monkeypatch.setattr(structure.shutil, "disk_usage", lambda _: Mock(free=10_000))
-    with pytest.raises(InputError, match="undistorted photographs may take .* 0.0 MB are free. Make room"):
-        structure.undistort(work / "model", work / "photos", tmp_path / "cut", lambda steps: None)
+    monkeypatch.setattr(structure.colmap(), "undistort_images", cut_one)
+    with pytest.raises(InputError, match=r"IMG_00.png cannot be decoded"):
+        write_scene(work / "model", work / "photos", tmp_path / "undistorted", tmp_path, lambda steps: None)
 
 
 # Collecting.
@@ -375,7 +364,7 @@ def test_focal_lengths_follow_photographs_that_were_made_smaller(tmp_path, make,
     exif.get_ifd(ExifTags.IFD.Exif).update({getattr(ExifTags.Base, name): value for name, value in tags.items()})
     photo(tmp_path / "a.jpg", (160, 120), exif=exif.tobytes())
     database = tmp_path / "database.db"
-    structure.extract_features(database, tmp_path, [["a.jpg"]], lambda _: None, "SIMPLE_RADIAL", 1600, 100)
+    structure.extract_features(database, tmp_path, [["a.jpg"]], lambda _: None, "SIMPLE_RADIAL", 100)
     with structure.colmap().Database.open(database) as opened:
         (camera,) = opened.read_all_cameras()
     assert camera.has_prior_focal_length and camera.mean_focal_length() == pytest.approx(focal_length, abs=0.01)
@@ -385,11 +374,11 @@ def test_a_photograph_that_colmap_leaves_out_is_named_and_so_is_a_full_disk(tmp_
     photo(tmp_path / "a.jpg", (160, 120))
     photo(tmp_path / "b.jpg", (120, 160))  # not of the one camera
     both, database = [["a.jpg", "b.jpg"]], tmp_path / "database.db"
-    full, left = "0.1 MB, and 0.0 MB are free. Make room", "b.jpg is left out by COLMAP"
-    for free, said in (10_000, full), (10**9, left), (10_000, left):  # at last the room is taken by the same work
+    full, left = "0.1 MB, and 0.1 MB are free. Make room", "b.jpg is left out by COLMAP"
+    for free, said in (60_000, full), (10**9, left), (60_000, left):  # at last the room is taken by the same work
         monkeypatch.setattr(structure.shutil, "disk_usage", lambda _, free=free: Mock(free=free))
         with pytest.raises(InputError, match=said):
-            structure.extract_features(database, tmp_path, both, lambda _: None, "SIMPLE_RADIAL", 1600, 100)
+            structure.extract_features(database, tmp_path, both, lambda _: None, "SIMPLE_RADIAL", 100)
 
 
 def test_names_stay_different_and_those_that_agree_share_a_camera_with_damaged_exif_as_none(tmp_path):

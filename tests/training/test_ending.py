@@ -5,8 +5,10 @@ import math
 import os
 import re
 import signal
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
@@ -190,6 +192,15 @@ def test_options_without_sense_are_refused(option, bad, tiny_scene):
     config = replace(config_with(option, bad), data=tiny_scene)
     with pytest.raises(InputError, match=re.escape(f"{option} is {bad}")):
         config.print_to_terminal()  # ns-train's first call: nothing is written before it
+
+
+@pytest.mark.parametrize(("vis", "package"), [("wandb", "wandb"), ("viewer+comet", "comet_ml")])
+def test_a_tracker_that_would_not_start_is_told_first(vis, package, tiny_scene, monkeypatch):
+    without_key = SimpleNamespace(login=Mock(side_effect=ValueError("No API key")), get_config=lambda _: None)
+    for module, finding in ((None, f"import of {package}"), (without_key, "No API key")):
+        monkeypatch.setitem(sys.modules, package, module)
+        with pytest.raises(InputError, match=rf"vis is {re.escape(vis)}.*{finding}.*by pip and log in"):
+            replace(config_with("vis", vis), data=tiny_scene).print_to_terminal()
 
 
 def test_a_scale_that_leaves_no_image_is_refused(tiny_scene, tmp_path):
