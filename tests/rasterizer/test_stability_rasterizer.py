@@ -87,6 +87,10 @@ def test_a_splat_of_planetary_size_is_an_even_veil(mode, exponent):
     assert torch.allclose(alpha, torch.full_like(alpha, 0.5), rtol=0, atol=1e-6)
 
 
+def test_a_splat_whose_square_overflows_harms_nothing():
+    assert_healthy(cloud(scales=[1e38] * 3))
+
+
 def test_a_splat_without_extent_is_a_point_of_blur():
     """Its covariance is 0.3 I: alpha = o exp(-d^2 / 0.6) within its square of 3 pixels, and its tiles."""
     for size in (0.0, 1e-45, math.exp(-40)):
