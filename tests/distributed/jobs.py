@@ -3,6 +3,8 @@
 
 from pathlib import Path
 
+import nerfstudio.configs.method_configs  # noqa: F401  (here, so that processes which are forked need not)
+import short_trainings  # noqa: F401  (likewise)
 import torch
 import torch.distributed as dist
 from device import BY_ERROR, PEAK, PIXELS, PLAIN, RICH, one_step, told, train

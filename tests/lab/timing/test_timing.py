@@ -10,7 +10,7 @@ import pytest
 import torch
 from short_trainings import LOUD, command_line, trained
 
-from nrfgs_lab.timing import fits, photographs, scale
+from nrfgs_lab.timing import photographs, scale
 from nrfgs_lab.timing.fits import Fits
 from nrfgs_lab.timing.photographs import Photographs, make
 from nrfgs_lab.timing.scale import Bare, Scale, as_table, at_megapixels, made, resampled
@@ -75,16 +75,6 @@ def test_trainings_and_parts_are_measured_once(tiny_scene, tmp_path, monkeypatch
     assert trained["splats"] == 300 and trained["steps"] == 2 and trained["psnr"] > 5
     run.main()
     assert run.out.read_text() == lines
-
-
-def test_a_smaller_card_has_cuda_s_own_part_too(monkeypatch):
-    card = {"is_available": True, "mem_get_info": (74e9, 80e9), "memory_reserved": 5e9, "reset_peak_memory_stats": None}
-    for name, value in card.items():
-        monkeypatch.setattr(torch.cuda, name, lambda value=value: value)
-    monkeypatch.setattr(torch.cuda, "set_per_process_memory_fraction", (shares := []).append)
-    for gigabytes in (12.0, 96.0):
-        fits.limit(gigabytes)
-    assert shares == [11 / 80, 1.0]
 
 
 def test_a_capture_is_made_and_read(tmp_path, monkeypatch, capsys):
