@@ -390,6 +390,7 @@ def test_large_photographs_come_small(tmp_path, monkeypatch):
     monkeypatch.setattr(Capture, "width", 640)
     monkeypatch.setattr(Capture, "height", 400)
     capture = Capture(tmp_path / "large", images=3)
+    capture.meta |= {"fl_x": 500.0, "fl_y": 500.0, "cx": 320.0, "cy": 200.0}
     for index, path in enumerate((capture.folder / "images").iterdir()):
         Image.radial_gradient("L").resize((640, 400)).convert("RGB").rotate(90 * index).save(path)
     dataset = NrfgsInputDataset(capture.parse())
