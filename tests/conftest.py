@@ -78,6 +78,15 @@ def export_gaussian_splat():
 
 
 @pytest.fixture
+def dataset_render():
+    """DatasetRender of `ns-render`, which imports mediapy, which imports IPython; skips where that is missing."""
+    pytest.importorskip("IPython", reason="ns-render imports IPython, which is not installed")
+    from nerfstudio.scripts.render import DatasetRender
+
+    return DatasetRender
+
+
+@pytest.fixture
 def no_cuda(monkeypatch):
     """Make anything that needs CUDA fail: gsplat's compiled kernels, `.cuda()`; and hide a GPU that is there."""
     import torch

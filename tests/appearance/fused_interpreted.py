@@ -157,21 +157,3 @@ def test_tiny_gradients_survive_half_precision():
         gradients.append(splats["latents"].grad / factor)
     assert gradients[0].abs().max() > 0
     assert torch.equal(*gradients)
-
-
-def test_rows_beyond_32_bit_offsets():
-    """The last rows of a table of more than 2^31 latents, which are never touched but for those rows."""
-    head, _ = heads(latent_dim=64, hidden_width=4)
-    count = 2**25 + 5
-    try:
-        splats = {"latents": torch.empty(count, 64), "means": torch.empty(count, 3)}
-    except RuntimeError:
-        pytest.skip("no 9 GB of address space")
-    splats |= {"features_dc": torch.empty(count, 3), "opacities": torch.empty(count, 1)}
-    visible = torch.arange(count - 3, count)
-    small, rows, centers = scene(head, 3, 3)
-    for name, table in splats.items():
-        table[count - 3 :] = small[name]
-    with torch.no_grad():
-        far, near = head(splats, visible, centers), head(small, rows.sort().values, centers)
-    assert torch.equal(far.colors, near.colors) and torch.equal(far.opacities, near.opacities)

@@ -13,7 +13,6 @@ import tyro
 from compact_fields import RENDER, field, read_container, through_a_file, write_container
 from hypothesis import given
 from hypothesis import strategies as st
-from nerfstudio.scripts.render import DatasetRender
 from scipy.spatial.transform import Rotation
 from short_trainings import command_line, set_up, trained
 from torch.testing import assert_close
@@ -169,7 +168,7 @@ def exported(tiny_scene, tmp_path_factory):
     return config, out / "small.nrf", compact(config, out / "small.nrf")
 
 
-def test_nerfstudios_commands_read_the_file(exported, tmp_path):
+def test_ns_eval_reads_the_file(exported, tmp_path):
     _, file, numbers = exported
     config = file.parent / "small.nrf.nerfstudio" / "nrfgs" / "compact" / "config.yml"
     results = evaluate(config, tmp_path / "eval.json")
@@ -182,8 +181,12 @@ def test_nerfstudios_commands_read_the_file(exported, tmp_path):
     assert abs(numbers["loss_db"]) < 0.03 and numbers["written"] == numbers["splats"] and numbers["rank"] == 8
     spread = decode(file).splats["latents"].std(dim=0)
     assert (spread.diff() < 1e-3).all() and spread[0] > 1.5 * spread[-1], "principal components, the strongest first"
-    DatasetRender(load_config=config, output_path=tmp_path / "renders", image_format="png").main()
-    assert len(list((tmp_path / "renders" / "test" / "rgb").rglob("*.png"))) == 2
+
+
+def test_ns_render_reads_the_file(exported, tmp_path, dataset_render):
+    config = exported[1].with_suffix(".nrf.nerfstudio") / "nrfgs" / "compact" / "config.yml"
+    dataset_render(load_config=config, output_path=tmp_path, image_format="png").main()
+    assert len(list((tmp_path / "test" / "rgb").rglob("*.png"))) == 2
 
 
 def test_the_files_config_is_read_from_any_folder(exported, tmp_path, monkeypatch):
@@ -296,10 +299,10 @@ def test_what_training_expects_is_what_a_file_has(tmp_path):
     assert of_places == pytest.approx({entry["name"]: entry["bytes"] for entry in entries}["means"], rel=0.03)
 
 
-@pytest.mark.parametrize("words", ["", "--finetune 120"])
-def test_a_size_is_reached_and_not_exceeded(words, exported, tmp_path, capsys):
+@pytest.mark.parametrize("words, shares", [("", (0.95, 0.8)), ("--finetune 120", (0.8,))])
+def test_a_size_is_reached_and_not_exceeded(words, shares, exported, tmp_path, capsys):
     config, file, _ = exported
-    for share in (0.95, 0.8):
+    for share in shares:
         limit, output = share * file.stat().st_size, tmp_path / f"{share}.nrf"
         found = compact(config, output, *words.split(), "--size-mb", str(limit / 1e6))
         assert 0.95 * limit <= found["bytes"] == output.stat().st_size <= limit

@@ -13,7 +13,7 @@ import struct
 import zlib
 from collections.abc import Callable, Iterator
 from copy import deepcopy
-from functools import cache
+from functools import cache, lru_cache
 from importlib.resources import files
 from pathlib import Path
 
@@ -26,8 +26,10 @@ from torch.testing import assert_close
 
 from nrfgs_ns.appearance.head import base_colors
 from nrfgs_ns.appearance.nrf import NrfConfig
+from nrfgs_ns.compact import format
 from nrfgs_ns.compact.decode import Decoded, decode
 from nrfgs_ns.compact.encode import encode
+from nrfgs_ns.compact.entropy import decode_table, encode_table
 from nrfgs_ns.compact.format import MODEL, PREAMBLE, Table, _pack, _unpack, container
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.trained.loading import load_file
@@ -41,6 +43,25 @@ COUNT = 20
 """Splats of the file that is damaged. Python's reader takes milliseconds for each."""
 BYTES = (0x01, 0x80)
 """What a byte is changed by (exclusive or)."""
+
+
+@pytest.fixture(autouse=True)
+def equal_tables_are_coded_once(monkeypatch):
+    """A file differs from the others in one place; most of its tables are theirs, and coding takes most of the time."""
+
+    @lru_cache(None, typed=True)
+    def encoded_once(numbers: bytes, dtype: str, shape: tuple, signed: bool):
+        return encode_table(np.frombuffer(numbers, dtype).reshape(shape), signed)
+
+    @lru_cache(None, typed=True)
+    def decoded_once(model: bytes, *rest):
+        return decode_table(np.frombuffer(model, "<i4"), *rest)
+
+    def encode(table, signed=True):
+        return encoded_once(table.tobytes(), table.dtype.str, table.shape, signed)
+
+    monkeypatch.setattr(format, "encode_table", encode)
+    monkeypatch.setattr(format, "decode_table", lambda model, *rest: decoded_once(model.astype("<i4").tobytes(), *rest))
 
 
 @cache

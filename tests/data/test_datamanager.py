@@ -34,15 +34,8 @@ def test_ordinary_images_are_read_as_nerfstudio_reads_them(capture, mode, scale,
     assert torch.equal(ours["image"], theirs["image"])
 
 
-@pytest.mark.parametrize("mode, channels, tolerance", [
-    ("P", 3, 0),
-    ("CMYK", 3, 0),
-    ("YCbCr", 3, 2),  # two conversions, each rounded
-    ("1", 3, 0),
-    ("LA", 4, 0),
-    ("transparent P", 4, 0),
-])  # fmt: skip
-def test_other_images_are_converted_to_colour(capture, mode, channels, tolerance):
+@pytest.mark.parametrize("mode, channels", [("P", 3), ("CMYK", 3), ("1", 3), ("LA", 4), ("transparent P", 4)])
+def test_other_images_are_converted_to_colour(capture, mode, channels):
     """nerfstudio takes each of these for something else, or stops without naming the file."""
     colours = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255]], dtype=np.uint8)
     if mode in ("1", "LA"):
@@ -50,15 +43,10 @@ def test_other_images_are_converted_to_colour(capture, mode, channels, tolerance
     pixels = colours[capture.rng.integers(0, len(colours), (9, 12))]
     image = Image.fromarray(pixels).convert(mode.split()[-1])
     options = {"transparency": 0} if mode == "transparent P" else {}
-    image.save(capture.folder / "images/001.png", "TIFF" if mode in ("CMYK", "YCbCr") else "PNG", **options)
-    if mode == "YCbCr":
-        try:
-            Image.open(capture.folder / "images/001.png").load()
-        except OSError:  # seen with 12.3, which Python 3.10 gets
-            pytest.skip("this Pillow cannot read the YCbCr TIFF that it writes")
+    image.save(capture.folder / "images/001.png", "TIFF" if mode == "CMYK" else "PNG", **options)
     data = NrfgsInputDataset(capture.parse()).get_data(1, "uint8")["image"]
     assert data.shape == (9, 12, channels)
-    assert np.abs(data[..., :3].numpy().astype(int) - pixels).max() <= tolerance
+    assert (data[..., :3].numpy() == pixels).all()
 
 
 def test_images_are_made_smaller_to_the_size_of_their_cameras(tmp_path, monkeypatch):

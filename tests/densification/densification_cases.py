@@ -5,7 +5,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from scipy.spatial.transform import Rotation
 from short_trainings import command_line
 from torch.nn import Parameter
@@ -112,14 +111,3 @@ def arguments(scene: Path, out: Path, densification: str, steps: int = 20, **rul
         "--pipeline.model.few-views": "off",
     }
     return command_line("nrfgs", scene, out, steps, options)
-
-
-def one_step(trainer, step: int) -> dict:
-    """What the trainer does in a step; returns the losses."""
-    trainer.pipeline.train()
-    for callback in trainer.callbacks:
-        callback.run_callback_at_location(step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
-    losses = trainer.train_iteration(step)[1]
-    for callback in trainer.callbacks:
-        callback.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
-    return losses

@@ -3,7 +3,7 @@
 
 import pytest
 import torch
-from densification_cases import REFINES, STRATEGIES, Table, arguments, one_step, strategy
+from densification_cases import REFINES, STRATEGIES, Table, arguments, strategy
 from short_trainings import set_up
 from torch.testing import assert_close
 
@@ -195,10 +195,10 @@ def test_the_peak_is_forgotten_at_reset():
 
 
 def test_the_peak_is_that_of_the_head(tiny_scene, tmp_path):
-    trainer = set_up(arguments(tiny_scene, tmp_path, "splatfacto", opacity_seen="peak"))
+    trainer = set_up(arguments(tiny_scene, tmp_path, "splatfacto", 2, opacity_seen="peak"))
     model = trainer.pipeline.model
     model.head.low[-1].bias.data[3] = 100.0  # d_alpha = 0.2 tanh(100) = 0.2
-    one_step(trainer, 1)  # at step 0 splatfacto resets
+    trainer.train()  # of its two steps the first one resets
     visible = torch.zeros(model.num_points, dtype=torch.bool)
     visible[model.info["gaussian_ids"]] = True
     assert visible.any() and not visible.all()

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Densification in a training: the losses that it adds, and that a continued training cannot tell."""
 
+from pathlib import Path
+
 import pytest
 from densification_cases import arguments
 from short_trainings import assert_same_training, checkpoint_of, models_of, set_up, trained
@@ -8,6 +10,7 @@ from short_trainings import assert_same_training, checkpoint_of, models_of, set_
 from nrfgs_ns.densification import CHANGE, UNSEEN, memory
 from nrfgs_ns.densification.strategy import GROWTH_LIMIT
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.training.checkpoint_files import read_latest
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -31,14 +34,18 @@ def test_the_extent_is_that_of_the_training_cameras(tiny_scene, tmp_path):
     assert trainer.pipeline.model.densification.state["scene_scale"] == pytest.approx(expected)
 
 
+HALF = 13
+"""A checkpoint after this step of 26 lies between two refinements, with statistics in flight."""
+
+
 @pytest.fixture
 def run(tiny_scene, tmp_path):
-    """A function: the last checkpoint of a training by a strategy, and the checkpoints' folder."""
+    """A function: config.yml of a training by a strategy, whole or from a folder's checkpoint of step HALF on."""
 
-    def run(name: str, densification: str, steps: int, load: dict | None = None, **rules) -> dict:
+    def run(name: str, densification: str, steps: int, load: Path | None = None, **rules) -> Path:
         args = arguments(tiny_scene, tmp_path / name, densification, steps, **rules)
-        config = trained([*args, *(["--load-dir", load["folder"]] if load else [])])
-        return checkpoint_of(config) | {"folder": str(models_of(config))}
+        more = ["--load-dir", str(load), "--load-step", str(HALF)] if load else ["--steps-per-save", str(HALF)]
+        return trained([*args, *more])
 
     return run
 
@@ -47,13 +54,12 @@ def run(tiny_scene, tmp_path):
     "densification, seen", [("splatfacto", "peak"), ("original", "base"), ("mcmc", "peak"), ("error-guided", "peak")]
 )
 def test_resumed_training_is_the_unbroken_one(densification, seen, run):
-    """26 steps at once, and 14 and 12 more: the checkpoint lies between two refinements, with statistics in flight."""
     rules = {"opacity_seen": seen}
     if densification == "mcmc":
         rules["budget"] = 330  # from 300: growth of 5 % at steps 4, 8, ... reaches it in the first half
-    whole, half = (run(name, densification, steps, **rules) for name, steps in (("whole", 26), ("half", 14)))
-    rest = run("rest", densification, 26, half, **rules)
-    assert whole["step"] == rest["step"] == 25
+    config = run("whole", densification, 26, **rules)
+    rest = checkpoint_of(run("rest", densification, 26, models_of(config), **rules))
+    half, whole = (read_latest(models_of(config), step)[1] for step in (HALF, 25))
     counts = [len(part["pipeline"]["_model.gauss_params.means"]) for part in (half, whole)]
     if densification == "mcmc":
         assert counts == [330, 330]
@@ -71,12 +77,13 @@ def test_growth_that_memory_holds_is_held_in_a_continued_training(densification,
     """Whatever memory there seems to be then: it is measured otherwise in another process."""
     measured = iter([310])
     monkeypatch.setattr(memory, "most_splats", lambda *_: next(measured, 10**6))
-    rest, measured = run("rest", densification, 26, run("half", densification, 14)), iter([310])
-    assert_same_training(run("whole", densification, 26), rest, rtol=0, atol=0)
+    whole = run("whole", densification, 26)
+    rest = checkpoint_of(run("rest", densification, 26, models_of(whole)))
+    assert_same_training(checkpoint_of(whole), rest, rtol=0, atol=0)
     assert 300 <= len(rest["pipeline"]["_model.gauss_params.means"]) <= 310
     assert rest["pipeline"]["_model._extra_state"]["strategy"][GROWTH_LIMIT] == (310, 0)
 
 
 def test_another_strategies_checkpoint_is_refused(run):
     with pytest.raises(InputError, match="densification original"):
-        run("b", "mcmc", 20, run("a", "original", 1))
+        run("b", "mcmc", 20, models_of(run("a", "original", HALF + 1)))

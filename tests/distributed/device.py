@@ -9,12 +9,9 @@ import torch
 import torch.distributed as dist
 from torch.multiprocessing import start_processes
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "helpers"))
+
 COMMON = {
-    "--vis": "tensorboard",
-    "--steps-per-eval-image": 1000,
-    "--steps-per-eval-all-images": 1000,
-    "--logging.local-writer.enable": False,
-    "--logging.profiler": "none",
     "--pipeline.model.num-downscales": 0,
     "--pipeline.model.background-color": "black",
     "--pipeline.model.few-views": "off",
@@ -37,12 +34,12 @@ BUSY = {"--pipeline.model.view-noise": 0.5}
 
 def trainer_of(scene: Path, out: Path, world: int, method: str = "nrfgs", **options):
     """A trainer, set up, on `world` devices, of which this process is one."""
+    from short_trainings import command_line
+
     from nrfgs_lab.training_run import parse, set_up
 
-    chosen = {"--data": scene, "--output-dir": out, **COMMON, **options}
-    if method == "nrfgs":
-        chosen["--pipeline.model.appearance.output-init"] = "default"
-    config = parse([method, *(str(word) for option in chosen.items() for word in option)])
+    loud = {"--pipeline.model.appearance.output-init": "default"} if method == "nrfgs" else {}
+    config = parse(command_line(method, scene, out, None, COMMON, options, loud))
     return set_up(config, dist.get_rank(), world)
 
 
@@ -153,7 +150,6 @@ def told(trainer) -> Path:
 
 def work(rank: int, job: str, world: int, scene: Path, folder: Path, device_type: str) -> None:
     """What one process does."""
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "helpers"))
     import device
     import jobs
     from processes import keep_what_is_imported, let_go

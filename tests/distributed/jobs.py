@@ -3,6 +3,8 @@
 
 from pathlib import Path
 
+import nerfstudio.configs.method_configs  # noqa: F401  (here, so that processes which are forked need not)
+import short_trainings  # noqa: F401  (likewise)
 import torch
 import torch.distributed as dist
 from device import BY_ERROR, PEAK, PIXELS, PLAIN, RICH, one_step, told, train
@@ -26,25 +28,25 @@ def everything(scene: Path, folder: Path) -> None:
     one_step(PLAIN, scene, folder, "plain")
     one_step(RICH, scene, folder, "rich")
     one_step(PIXELS, scene, folder, "pixels")
-    fifty_steps(scene, folder)
+    thirty_steps(scene, folder)
     there_and_back(scene, folder)
     stops_together(scene, folder)
     held_together(scene, folder)
     averaged(scene, folder)
 
 
-def fifty_steps(scene: Path, folder: Path) -> None:
-    """50 steps with splits, pruning and resets; how the shards fared is saved beside the checkpoint."""
+def thirty_steps(scene: Path, folder: Path) -> None:
+    """30 steps with splits, pruning and resets; how the shards fared is saved beside the checkpoint."""
     counts = []
 
     def watch(trainer) -> None:
         model = trainer.pipeline.model
         after_each(trainer, lambda step: counts.append((step, model.num_points, list(model.counts))))
 
-    trainer = train(scene, folder / "fifty", dist.get_world_size(), 50, watch=watch, **PLAIN, **MORE)
+    trainer = train(scene, folder / "thirty", dist.get_world_size(), 30, watch=watch, **PLAIN, **MORE)
     shared = {name: value.detach().cpu() for name, value in trainer.pipeline.model.head.named_parameters()}
     result = {"counts": counts, "shared": shared, "saved": str(told(trainer))}
-    torch.save(result, folder / f"fifty-{dist.get_rank()}.pt")
+    torch.save(result, folder / f"thirty-{dist.get_rank()}.pt")
 
 
 def after_each(trainer, do) -> None:
@@ -94,7 +96,7 @@ def holds(trainer) -> dict:
 def fits_one_process(scene: Path, folder: Path) -> None:
     """Device 0's image and loss in the first step, and those of one process; in the devices' own precision."""
     one_step(PLAIN, scene, folder, "step", prepare=lambda trainer: None)
-    fifty_steps(scene, folder)
+    thirty_steps(scene, folder)
 
 
 def stops_together(scene: Path, folder: Path) -> None:

@@ -127,7 +127,7 @@ def test_step_on_gpus(on_gpus):
 
 
 @gpus
-def test_fifty_steps_on_gpus(on_gpus):
-    first, second = (torch.load(on_gpus / f"fifty-{rank}.pt") for rank in (0, 1))
+def test_thirty_steps_on_gpus(on_gpus):
+    first, second = (torch.load(on_gpus / f"thirty-{rank}.pt") for rank in (0, 1))
     assert sum(first["counts"][-1][2]) > 300
     assert first["counts"][-1][2] == second["counts"][-1][2] == [first["counts"][-1][1], second["counts"][-1][1]]

@@ -3,8 +3,6 @@
 
 import functools
 import re
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -368,13 +366,3 @@ def test_whoever_cannot_see_the_page_is_told_what_is_there(on_demo):
     assert page.page.get_by_role("status").filter(has_text=re.compile("^Photograph ")).count() == 1
     for role, expanded in (("true", "Help"), ("false", "View")):
         assert page.page.get_by_role("button", name=expanded, exact=True).get_attribute("aria-expanded") == role
-
-
-def test_pictures_for_the_docs(demo, tmp_path):
-    words = [sys.executable, "-m", "nrfgs_lab.pages.pictures", demo[1], tmp_path / "out"]
-    run = subprocess.run(words, capture_output=True, text=True)
-    assert run.returncode == 0, run.stderr
-    written = sorted(path.name for path in (tmp_path / "out").iterdir())
-    shown = [f"{window}-{name}.jpg" for window in ("desktop", "phone") for name in ("page", "share", "view")]
-    assert written == [*shown, "swing.webp", "web.jpg"]
-    assert all(np.asarray(Image.open(tmp_path / "out" / name)).std() > 5 for name in written)

@@ -41,7 +41,7 @@ LOUD = {
 """A small field that says something before it is trained."""
 
 
-def command_line(method: str, scene: Path, out: Path, steps: int, *options: dict[str, Any]) -> list[str]:
+def command_line(method: str, scene: Path, out: Path, steps: int | None, *options: dict[str, Any]) -> list[str]:
     """Words after `ns-train` of a quiet training; `steps` include those before the checkpoint that it goes on from.
 
     Options are values by option, dashes included; of several the last counts, and None takes the option away.

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kernels of the loss, growth, the tiles' lists and compositing in Triton's interpreter against their twins."""
 
+from dataclasses import replace
+
 import pytest
 import quick_interpreter  # noqa: F401
 import torch
@@ -131,7 +133,16 @@ def ours(monkeypatch):
         yield
 
 
+def window(case):
+    """3 x 2 tiles from the middle of an image: the interpreter takes half a second for each."""
+    width, height = min(case.width, 24), min(case.height, 12)
+    Ks = case.Ks.clone()
+    Ks[:, :2, 2] -= 8.0 * torch.tensor([(case.width - width) // 16, (case.height - height) // 16])
+    return replace(case, Ks=Ks, width=width, height=height)
+
+
 def check(case):
+    case = window(for_our_kernels(case))
     grads = upstream(case)
     assert_agrees(judge(case, grads), evaluate(rasterization, case, grads, "cpu"))
 
@@ -141,22 +152,22 @@ def check(case):
 )
 def test_hard_cases(ours, name):
     """Together more splats in a tile than a batch, light that runs out, alphas at both cut-offs and at the cap."""
-    check(for_our_kernels(CASES[name]()))
+    check(CASES[name]())
 
 
 @settings(max_examples=12, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(case=scenes().map(for_our_kernels))
+@given(case=scenes())
 def test_random_scenes(ours, case):
     check(case)
 
 
 def test_a_background_shines_through_and_has_a_gradient(ours):
-    info = assert_background_shines(CASES["one_splat"]())
-    assert info["tile_size"] == 8 and info["isect_offsets"].shape == (1, 5, 5)
+    info = assert_background_shines(window(CASES["one_splat"]()))
+    assert info["tile_size"] == 8 and info["isect_offsets"].shape == (1, 3, 3)
 
 
 def test_what_gsplats_kernels_composite(ours, monkeypatch):
-    case = CASES["one_splat"]()
+    case = window(CASES["one_splat"]())
     rasterization(*case.arguments())
     with torch.no_grad(), pytest.raises(Theirs):
         rasterization(*case.arguments())

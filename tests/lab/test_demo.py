@@ -13,7 +13,7 @@ from nrfgs_lab.scenes import SceneConfig
 
 @pytest.mark.usefixtures("no_cuda")
 def test_demo_trains_compares_and_writes_pictures(tmp_path, capfd, monkeypatch):
-    small = SceneConfig(studio=True, arc=90, views=12, width=64, height=48, points=500, test_every=4)
+    small = SceneConfig(studio=True, arc=90, views=12, width=64, height=48, points=500, test_every=4, samples=1)
     monkeypatch.setattr(Demo, "scene", lambda self: small)
     Demo(out=tmp_path / "demo", quick=True, steps=6, compare=True).main()
     results = json.loads((tmp_path / "demo" / "results.json").read_text())

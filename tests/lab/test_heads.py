@@ -31,7 +31,7 @@ def finished(request, tiny_scene, tmp_path_factory) -> tuple[str, Path]:
 SMALL = {
     "deferred": DeferredConfig(channels=6, hidden_width=5, hidden_layers=2),
     "deferred, features as they are": DeferredConfig(channels=4, harmonics=False, hidden_width=5, hidden_layers=1),
-    "latent-spec": LatentSpecConfig(diffuse_dim=3, specular_dim=1, hidden_width=3),
+    "latent-spec": LatentSpecConfig(diffuse_dim=3, specular_dim=1, hidden_width=1),
 }
 
 

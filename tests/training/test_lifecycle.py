@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 import torch
 from nerfstudio.scripts.eval import ComputePSNR
-from nerfstudio.scripts.render import DatasetRender
 from nerfstudio.utils.eval_utils import eval_setup
 from rich.console import Console
 from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, set_up, trained, untrained
@@ -74,7 +73,7 @@ def finished(tiny_scene, tmp_path_factory):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_train_eval_render(method, finished, tmp_path, tiny_scene, recwarn, printed):
+def test_train_and_eval(method, finished, tmp_path, recwarn, printed):
     config = finished(method)
     results = evaluate(config, tmp_path / "eval.json")
     assert not [warning for warning in recwarn if "degrees of freedom" in str(warning.message)]
@@ -98,19 +97,22 @@ def test_train_eval_render(method, finished, tmp_path, tiny_scene, recwarn, prin
         if group != "field":
             assert learning[0]["exp_avg"].shape == state["pipeline"][f"_model.gauss_params.{group}"].shape
 
-    if method != "nrfgs":
-        return
-    pipeline.print_evaluation(results | {"per_image": [*images, {"image": "hidden.png", "psnr": None}]})
-    assert re.search(r"(?s)Means over 2 test views\b.*nothing to measure of hidden.png", printed())
-    ComputePSNR(config, tmp_path / "again.json", render_output_path=tmp_path / "pairs").main()
-    assert [file.name[:13] for file in sorted((tmp_path / "pairs").iterdir())] == ["eval_img_0000", "eval_img_0001"]
-    DatasetRender(load_config=config, output_path=tmp_path / "renders", image_format="png").main()
+    if method == "nrfgs":
+        pipeline.print_evaluation(results | {"per_image": [*images, {"image": "hidden.png", "psnr": None}]})
+        assert re.search(r"(?s)Means over 2 test views\b.*nothing to measure of hidden.png", printed())
+        ComputePSNR(config, tmp_path / "again.json", render_output_path=tmp_path / "pairs").main()
+        assert [file.name[:13] for file in sorted((tmp_path / "pairs").iterdir())] == ["eval_img_0000", "eval_img_0001"]
+
+
+def test_renderings_have_the_names_of_their_photographs(finished, tmp_path, tiny_scene, dataset_render):
+    config = finished("nrfgs")
+    dataset_render(load_config=config, output_path=tmp_path / "renders", image_format="png").main()
     names = json.loads((tiny_scene / "transforms.json").read_text())["test_filenames"]
     for output in ("rgb", "depth", "accumulation", "gt-rgb"):
         folder = tmp_path / "renders" / "test" / output
         assert sorted(file.stem for file in folder.rglob("*.png")) == sorted(Path(name).stem for name in names)
     half = {"image_format": "png", "rendered_output_names": ["rgb", "gt-rgb"], "downscale_factor": 2.0}
-    DatasetRender(load_config=config, output_path=tmp_path / "half", **half).main()
+    dataset_render(load_config=config, output_path=tmp_path / "half", **half).main()
     assert [read_size(file) for file in (tmp_path / "half").rglob("*.png")] == 4 * [(24, 18)]
 
 

@@ -19,16 +19,15 @@ from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException, SetTrace
 from PIL import Image
 from short_trainings import assert_same_training, checkpoint_of, command_line, set_up, untrained
+from small_capture import Capture
 from torch.testing import assert_close
 from viser import _icons, _scene_api
 from viser.infra import _infra
 
-from nrfgs_lab.scenes import SceneConfig, write_scene
 from nrfgs_ns.appearance.head import Field, SplatAppearance
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.data.datamanager import NrfgsInputDataset
-from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.image.photograph import BASIS, exposed
 from nrfgs_ns.rasterizer import View
 from nrfgs_ns.viewer import pictures as drawn
@@ -387,9 +386,14 @@ def test_icons_and_pictures_are_visers(pipeline, monkeypatch):
     assert ours == [_scene_api._encode_image_binary(picture, kind) for kind in ("jpeg", "png")]
 
 
-def test_large_photographs_come_small(tmp_path):
-    scene = write_scene(SceneConfig(views=3, width=640, height=400, points=50, samples=1), tmp_path / "large")
-    dataset = NrfgsInputDataset(NrfgsDataParserConfig(data=scene).setup().get_dataparser_outputs("train"))
+def test_large_photographs_come_small(tmp_path, monkeypatch):
+    monkeypatch.setattr(Capture, "width", 640)
+    monkeypatch.setattr(Capture, "height", 400)
+    capture = Capture(tmp_path / "large", images=3)
+    capture.meta |= {"fl_x": 500.0, "fl_y": 500.0, "cx": 320.0, "cy": 200.0}
+    for index, path in enumerate((capture.folder / "images").iterdir()):
+        Image.radial_gradient("L").resize((640, 400)).convert("RGB").rotate(90 * index).save(path)
+    dataset = NrfgsInputDataset(capture.parse())
     read = [dataset.get_data(index, image_type="uint8") for index in range(len(dataset))]
     for images in (read, None):  # in memory, or in files
         small = start.SmallPhotographs(dataset, images)

@@ -3,6 +3,7 @@
 
 import json
 import shutil
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ def spec(**more):
     return make_spec({**SMALL, **more}, "test.yaml")
 
 
+@cache
 def plans() -> dict[tuple[str, str], Spec]:
     """Each plan of the shipped files, by file and name."""
     result = {}

@@ -2,13 +2,15 @@
 """`nrfgs_lab.timing.scale`: its cells are measured once, from made splats and from a training's."""
 
 import json
+import sys
+from pkgutil import resolve_name
 from types import SimpleNamespace
 
 import pytest
 import torch
 from short_trainings import LOUD, command_line, trained
 
-from nrfgs_lab.timing import fits, scale
+from nrfgs_lab.timing import photographs, scale
 from nrfgs_lab.timing.fits import Fits
 from nrfgs_lab.timing.photographs import Photographs, make
 from nrfgs_lab.timing.scale import Bare, Scale, as_table, at_megapixels, made, resampled
@@ -75,17 +77,18 @@ def test_trainings_and_parts_are_measured_once(tiny_scene, tmp_path, monkeypatch
     assert run.out.read_text() == lines
 
 
-def test_a_smaller_card_has_cuda_s_own_part_too(monkeypatch):
-    card = {"is_available": True, "mem_get_info": (74e9, 80e9), "memory_reserved": 5e9, "reset_peak_memory_stats": None}
-    for name, value in card.items():
-        monkeypatch.setattr(torch.cuda, name, lambda value=value: value)
-    monkeypatch.setattr(torch.cuda, "set_per_process_memory_fraction", (shares := []).append)
-    for gigabytes in (12.0, 96.0):
-        fits.limit(gigabytes)
-    assert shares == [11 / 80, 1.0]
+def test_a_capture_is_made_and_read(tmp_path, monkeypatch, capsys):
+    """In this process: another one would import everything again."""
 
+    def run(command, **_):
+        monkeypatch.setattr(sys, "argv", command[2:])
+        capsys.readouterr()
+        exec(command[2], {})
+        return SimpleNamespace(stdout=capsys.readouterr().out)
 
-def test_a_capture_is_made_and_read(tmp_path):
+    for path in photographs.PARTS.values():  # which are replaced for good
+        monkeypatch.setattr(path, resolve_name(path))
+    monkeypatch.setattr(photographs, "subprocess", SimpleNamespace(run=run, PIPE=None))
     make(tmp_path / "small", 10, 60, 40)
     Photographs(tmp_path / "out.json", data=(tmp_path / "small",)).main()
     (record,) = json.loads((tmp_path / "out.json").read_text())["records"].values()
