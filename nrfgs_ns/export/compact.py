@@ -38,24 +38,22 @@ PLY_BYTES = 62 * 4
 """Bytes of a splat in 3DGS's PLY file, with harmonics of degree 3."""
 
 
-def export_compact(
-    load_config: Path, output: Path, options: CompactOptions, measure: bool, report: Path | None
-) -> None:
+def export_compact(load_config: Path, options: CompactOptions) -> None:
     """Write a compact file, and report its size and loss; see `nrfgs export compact --help`."""
     with few_threads() as threads:
-        pipeline = load_field(load_config, measure)
+        pipeline = load_field(load_config, options.measure)
         threads.suit_to(pipeline)
-        config, numbers = write_file(pipeline, load_config, output, options, measure)
+        config, numbers = write_file(pipeline, load_config, output := options.output, options)
     count, size, ply_size = (numbers[name] for name in ("written", "bytes", "ply_bytes"))
     lines = [
         f"{output}: {count:,} splats with latents of {numbers['rank']} numbers, {size / 1e6:.2f} MB, "
         f"{size / count:.1f} bytes a splat: 3DGS's PLY of as many splats has {ply_size / 1e6:.2f} MB, "
         f"{ply_size / size:.1f} times as much."
     ]
-    lines += [lost(numbers)] if measure else []
+    lines += [lost(numbers)] if options.measure else []
     lines.append(f"Look at it with:  nrfgs view {quote(str(output))}")
     lines.append(f"Evaluate it with:  ns-eval --load-config {quote(str(config))}")
-    finish(lines, numbers, report)
+    finish(lines, numbers, options.report)
 
 
 def load_field(load_config: Path, measured: bool) -> NrfgsPipeline:
@@ -73,7 +71,6 @@ def write_file(
     load_config: Path,
     output: Path,
     options: CompactOptions,
-    measure: bool,
     total: Callable[[int], int] = lambda size: size,
 ) -> tuple[Path, dict[str, Any]]:
     """Write a compact file; returns the config.yml with which nerfstudio reads it, and numbers for a report.
@@ -121,7 +118,7 @@ def write_file(
         "ply_ratio": PLY_BYTES * count / size,
         "stream_bytes": {entry["name"]: entry["bytes"] for entry in decoded.header["streams"]},
     }
-    if measure:
+    if options.measure:
         file = load_model(config, "test").model  # as ns-eval reads it
         numbers |= measure_loss(pipeline, lambda camera: {"file": file.get_outputs_for_camera(camera)["rgb"]})
     return config, numbers

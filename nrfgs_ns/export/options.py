@@ -1,16 +1,44 @@
 # SPDX-License-Identifier: Apache-2.0
 """Options of the three formats, which are read before torch is imported."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
+
+from nrfgs_ns.errors import InputError
+from nrfgs_ns.files import check_writable
+from nrfgs_ns.trained.find import NamesTraining
 
 SCENE = "scene.nrf"
 """Name of the scene's file in a page's folder."""
 
 
 @dataclass
-class PlyOptions:
+class ExportOptions(NamesTraining):
+    """Options of all formats."""
+
+    output: Path = field(kw_only=True)
+    """the file to write; an older one is replaced"""
+    measure: bool = True
+    """render the test views from the model and from the written file, and print the difference"""
+    report: Path | None = None
+    """also write the numbers to this file, as JSON"""
+
+    def checked(self, *files: Path) -> Path:
+        """The config.yml; paths that are written at the end are checked, the format's `files` among them."""
+        config = self.config()
+        taken = {config.resolve(): "the training's file"}
+        for option, path in (("--report", self.report), *(("--output", file) for file in files)):
+            if path is not None:
+                check_writable(path, option)
+                if (other := taken.setdefault(path.resolve(), option)) != option:
+                    raise InputError(f"{option} {path} would replace {other}. Give each a name of its own.")
+        return config
+
+
+@dataclass
+class PlyOptions(ExportOptions):
     """Options of a PLY file."""
 
     world: Literal["viewers", "training", "capture"] = "viewers"
@@ -23,7 +51,7 @@ class PlyOptions:
 
 
 @dataclass
-class CompactOptions:
+class CompactOptions(ExportOptions):
     """How a compact file is made smaller."""
 
     finetune: int = 0
@@ -34,9 +62,17 @@ class CompactOptions:
     """millions of bytes that the output may have: it becomes as precise as that allows. With finetune the rate is
     found while it trains, and rate is where it begins"""
 
+    def checked(self, *files: Path) -> Path:
+        for name in ("finetune", "rate"):
+            if not (value := getattr(self, name)) >= 0:
+                raise InputError(f"--{name} is {value}; it must be zero or positive.")
+        if self.size_mb is not None and not 0 < self.size_mb < math.inf:
+            raise InputError(f"--size-mb is {self.size_mb}; it must be positive, in millions of bytes.")
+        return super().checked(*files)
+
 
 @dataclass
-class WebOptions:
+class WebOptions(CompactOptions):
     """What a page says, and what it does by itself until the first touch."""
 
     title: str | None = None
@@ -51,3 +87,8 @@ class WebOptions:
     """JSON file of notes at points of the scene, as a page saves it"""
     address: str | None = None
     """where the page will be, https://...: writes a picture beside it, which is shown where the address is shared"""
+
+    @property
+    def is_alone(self) -> bool:
+        """Whether the page is one file, not a folder."""
+        return self.output.suffix.lower() in (".html", ".htm")

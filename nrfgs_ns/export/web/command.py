@@ -19,7 +19,7 @@ from nrfgs_ns.data.pictures import picture_names
 from nrfgs_ns.data.views import evenly_spaced, in_view
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.compact import load_field, write_file
-from nrfgs_ns.export.options import SCENE, CompactOptions, WebOptions
+from nrfgs_ns.export.options import SCENE, WebOptions
 from nrfgs_ns.export.web.guide import read_notes, read_tour
 from nrfgs_ns.export.web.page import page
 from nrfgs_ns.files import write_whole
@@ -35,17 +35,15 @@ MOST_POINTS = 20_000
 """Splats from which a photograph's distance to its subject is estimated."""
 
 
-def export_web(
-    load_config: Path, output: Path, options: CompactOptions, web: WebOptions, measure: bool, report: Path | None
-) -> None:
+def export_web(load_config: Path, options: WebOptions) -> None:
     """Write a page, or into a folder a page beside its scene; see `nrfgs export web --help`."""
-    if web.address is not None and not web.address.startswith(("https://", "http://")):
-        raise InputError(f"--address {web.address} is no web address. Give all of it, with https://.")
-    alone = output.suffix.lower() in (".html", ".htm")
+    output, alone, address = options.output, options.is_alone, options.address
+    if address is not None and not address.startswith(("https://", "http://")):
+        raise InputError(f"--address {address} is no web address. Give all of it, with https://.")
     with few_threads() as threads:
-        pipeline = load_field(load_config, measure)
+        pipeline = load_field(load_config, options.measure)
         names = picture_names(pipeline.datamanager.train_dataset.image_filenames)
-        guide = {"tour": read_tour(web.tour, names), "notes": read_notes(web.notes), "rotate": web.rotate}
+        guide = {"tour": read_tour(options.tour, names), "notes": read_notes(options.notes), "rotate": options.rotate}
         threads.suit_to(pipeline)
         if (vectors := weight_vectors(pipeline.model.head)) > MOST_WEIGHTS:
             raise InputError(
@@ -53,16 +51,16 @@ def export_web(
                 f"{MOST_WEIGHTS}. Train with a smaller hidden_width, or fewer num_bands."
             )
         about, poster = surroundings(pipeline)
-        title = output.stem if web.title is None else web.title
+        title = output.stem if options.title is None else options.title
         picture = output.with_suffix(".jpg") if alone else output / "preview.jpg"
-        preview = "" if web.address is None else urljoin(web.address if alone else f"{web.address}/", picture.name)
-        around = len(page(about | guide, poster, b"" if alone else SCENE, title, web.author, preview).encode())
+        preview = "" if address is None else urljoin(address if alone else f"{address}/", picture.name)
+        around = len(page(about | guide, poster, b"" if alone else SCENE, title, options.author, preview).encode())
         with TemporaryDirectory() as temporary:
             file = Path(temporary) / SCENE
             total = lambda size: around + (-(-size // 3) * 4 if alone else size)  # noqa: E731 -- base64 in a page
-            _, numbers = write_file(pipeline, load_config, file, options, measure, total)
+            _, numbers = write_file(pipeline, load_config, file, options, total)
             scene = file.read_bytes()
-    text = page(about | guide, poster, scene if alone else SCENE, title, web.author, preview)
+    text = page(about | guide, poster, scene if alone else SCENE, title, options.author, preview)
     contents = {output: text.encode()} if alone else {output / SCENE: scene, output / "index.html": text.encode()}
     for path, content in (contents | ({picture: poster} if preview else {})).items():
         write_whole(path, content)
@@ -72,10 +70,10 @@ def export_web(
         f"{output}: {numbers['written']:,} splats, {size / 1e6:.2f} MB; 3DGS's PLY of as many splats has "
         f"{numbers['ply_bytes'] / 1e6:.2f} MB. It begins where {name} was taken."
     ]
-    lines += [lost(numbers)] if measure else []
+    lines += [lost(numbers)] if options.measure else []
     lines += [f"{picture}: the picture for {preview}."] if preview else []
     lines.append("Open it in a browser." if alone else "Put the folder on a web server: see docs/web.md.")
-    finish(lines, numbers | {"bytes": size, "scene_bytes": len(scene), "start": name}, report)
+    finish(lines, numbers | {"bytes": size, "scene_bytes": len(scene), "start": name}, options.report)
 
 
 def weight_vectors(head: NeuralResidualField) -> int:
