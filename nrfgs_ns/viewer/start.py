@@ -77,7 +77,9 @@ class SmallPhotographs:
 
 
 def _init_with_small_photographs(init_scene: Callable[..., None], viewer: Viewer, train_dataset, *args, **options):
-    """Open the scene with small photographs."""
+    """Open the scene with small photographs, and show it to browsers that were there before it."""
     read = vars(viewer.pipeline.datamanager).get("cached_train")
     with few_threads():
         init_scene(viewer, SmallPhotographs(train_dataset, read), *args, **options)
+    for client in viewer.viser_server.get_clients().values():
+        viewer.pipeline.model.viewer_panel.welcome(client)
