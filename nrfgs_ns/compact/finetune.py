@@ -93,7 +93,6 @@ class Density(nn.Module):
     def __init__(self, values: Tensor):
         super().__init__()
         columns = values.shape[1]
-        values = values if len(values) else values.new_zeros(1, columns)
         spread, mean = values.std(dim=0, correction=0), values.mean(dim=0)
         widths = spread.clamp_min(1e-6).log()[:, None] + values.new_tensor(WIDTHS)
         self.centers = nn.Parameter(mean[:, None].repeat(1, len(WIDTHS)))
@@ -170,13 +169,10 @@ class CodedSplats(nn.Module):
     def keep(self, kept: Tensor, optimizer: torch.optim.Optimizer) -> None:
         """Remove the splats that are not `kept`, bool [N], and their optimizer state."""
         for group, table in zip(optimizer.param_groups, self.tables.values(), strict=False):
-            old = table.values
-            table.values = nn.Parameter(old[kept])
+            state = optimizer.state.pop(table.values, {})
+            table.values = nn.Parameter(table.values[kept])
             group["params"] = [table.values]
-            optimizer.state[table.values] = {
-                key: value[kept] if value.shape == old.shape else value
-                for key, value in optimizer.state.pop(old, {}).items()
-            }
+            optimizer.state[table.values] = {key: value[kept] if value.ndim else value for key, value in state.items()}
 
     @staticmethod
     def _row(tables: Mapping[str, Tensor]) -> Tensor:
@@ -269,8 +265,7 @@ def fine_tune(
     smallest, largest = (limit / (8 * count) for limit in RATES_FOR_SIZE)
     haste = min(HASTE * EVERY / steps, HASTIEST)
     rates = RATES | {"means": RATES["means"] * model.scene_unit}
-    if len(latents := coded.tables["latents"].values) > 1:
-        rates["latents"] *= float(latents.detach().std(dim=0, correction=0).max())
+    rates["latents"] *= float(coded.tables["latents"].values.detach().std(dim=0, correction=0).max())
     groups = [
         *({"params": [table.values], "lr": rates[name]} for name, table in coded.tables.items()),
         {"params": [table.log_steps for table in coded.tables.values()], "lr": STEPS_RATE},

@@ -5,7 +5,6 @@ import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from shlex import quote
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from nrfgs_ns.compact.encode import encode
 from nrfgs_ns.compact.finetune import REPORT_EVERY, fine_tune
 from nrfgs_ns.compact.format import container
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.export.options import CompactOptions
+from nrfgs_ns.export.command import Compact
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.progress import progress
 from nrfgs_ns.threads import few_threads
@@ -38,7 +37,7 @@ PLY_BYTES = 62 * 4
 """Bytes of a splat in 3DGS's PLY file, with harmonics of degree 3."""
 
 
-def export_compact(load_config: Path, options: CompactOptions) -> None:
+def export_compact(load_config: Path, options: Compact) -> None:
     """Write a compact file, and report its size and loss; see `nrfgs export compact --help`."""
     with few_threads() as threads:
         pipeline = load_field(load_config, options.measure)
@@ -70,7 +69,7 @@ def write_file(
     pipeline,
     load_config: Path,
     output: Path,
-    options: CompactOptions,
+    options: Compact,
     total: Callable[[int], int] = lambda size: size,
 ) -> tuple[Path, dict[str, Any]]:
     """Write a compact file; returns the config.yml with which nerfstudio reads it, and numbers for a report.
@@ -78,12 +77,14 @@ def write_file(
     Args:
         total: bytes of the compact file -> bytes of all that is written, for `options.size_mb`.
     """
-    times = [perf_counter()]
     model = pipeline.model
     field = model.field.detached()
     steps = rate = None
-    render = {"rasterize_mode": model.config.rasterize_mode, "background": model.background_color.tolist()}
-    render["near_plane"] = model.projection_options.near_plane
+    render = {
+        "rasterize_mode": model.config.rasterize_mode,
+        "background": model.background_color.tolist(),
+        "near_plane": model.projection_options.near_plane,
+    }
     limit = None if options.size_mb is None else 1e6 * options.size_mb
     if options.finetune > 0:
         with progress("Training for the file", -(-options.finetune // REPORT_EVERY)) as advance:
@@ -97,19 +98,15 @@ def write_file(
     else:  # latents in principal components, of which the small ones are rounded to 0 and take few bytes
         basis = latent_basis(field, torch.ones(model.num_points, device=model.device))
         field = with_rank(field, basis, field.head.config.latent_dim)
-    times.append(perf_counter())
     data, coarser = encoded(field, render, steps, limit, total)
     write_whole(output, data)
-    times.append(perf_counter())
     decoded = decode(output)
-    times.append(perf_counter())
     config = write_config(load_config, output, decoded.config)
     count = len(decoded.splats["means"])
     numbers = {
         "splats": model.num_points,
         "written": count,
         "rank": decoded.config.latent_dim,
-        "seconds": dict(zip(("finetune", "encode", "decode"), np.diff(times).tolist(), strict=True)),
         "finetune": options.finetune,
         "rate": rate,
         "coarser": coarser,

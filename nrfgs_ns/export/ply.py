@@ -22,8 +22,8 @@ from nrfgs_ns.appearance.head import Field
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.data.views import in_view
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.export.command import Ply
 from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, Similarity, to_capture
-from nrfgs_ns.export.options import PlyOptions
 from nrfgs_ns.files import whole
 from nrfgs_ns.model.harmonics_fit import PlainSplats
 from nrfgs_ns.model.pinholes import pinhole
@@ -48,7 +48,7 @@ WORTH_A_WORD = 0.1
 """Loss in dB from which the command mentions it."""
 
 
-def export_ply(load_config: Path, options: PlyOptions) -> None:
+def export_ply(load_config: Path, options: Ply) -> None:
     """Write a PLY file, and report what it costs; see `nrfgs export ply --help`."""
     output = options.output
     with few_threads() as threads:

@@ -18,8 +18,8 @@ from nrfgs_ns.appearance.reduce import branches
 from nrfgs_ns.data.pictures import picture_names
 from nrfgs_ns.data.views import evenly_spaced, in_view
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.export.command import SCENE, Web
 from nrfgs_ns.export.compact import load_field, write_file
-from nrfgs_ns.export.options import SCENE, WebOptions
 from nrfgs_ns.export.web.guide import read_notes, read_tour
 from nrfgs_ns.export.web.page import page
 from nrfgs_ns.files import write_whole
@@ -35,9 +35,9 @@ MOST_POINTS = 20_000
 """Splats from which a photograph's distance to its subject is estimated."""
 
 
-def export_web(load_config: Path, options: WebOptions) -> None:
+def export_web(load_config: Path, options: Web) -> None:
     """Write a page, or into a folder a page beside its scene; see `nrfgs export web --help`."""
-    output, alone, address = options.output, options.is_alone, options.address
+    output, alone, address = options.output, options.alone, options.address
     if address is not None and not address.startswith(("https://", "http://")):
         raise InputError(f"--address {address} is no web address. Give all of it, with https://.")
     with few_threads() as threads:
