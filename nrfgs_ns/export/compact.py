@@ -85,7 +85,7 @@ def write_file(
         "background": model.background_color.tolist(),
         "near_plane": model.projection_options.near_plane,
     }
-    limit = None if options.size_mb is None else 1e6 * options.size_mb
+    limit = math.inf if options.size_mb is None else 1e6 * options.size_mb
     if options.finetune > 0:
         with progress("Training for the file", -(-options.finetune // REPORT_EVERY)) as advance:
             field, steps, rate = fine_tune(
@@ -93,7 +93,7 @@ def write_file(
                 options.finetune,
                 options.rate,
                 lambda bits: advance(f"Training for the file ({bits / 8e6:.2f} MB)"),
-                None if limit is None else size_of_tables(field, render, limit, total),
+                None if limit == math.inf else size_of_tables(field, render, limit, total),
             )
     else:  # latents in principal components, of which the small ones are rounded to 0 and take few bytes
         basis = latent_basis(field, torch.ones(model.num_points, device=model.device))
@@ -135,32 +135,27 @@ def encoded(
     field: Field,
     render: dict[str, Any],
     steps: Mapping[str, np.ndarray] | None,
-    limit: float | None,
+    limit: float,
     total: Callable[[int], int],
 ) -> tuple[bytes, float]:
     """A compact file, and the factor of its grids' steps: 1, unless all that is written would have more than `limit`
     bytes. Then it has at most these, and more than ENOUGH of them after few attempts; InputError if the coarsest file
     has more."""
     files: dict[float, bytes] = {}  # by the logarithm (base 2) of the factor
-
-    def attempt(log: float) -> int:
+    log, last = 0.0, None
+    slope = (13 * len(field.splats["means"]) + field.splats["latents"].numel()) / 8  # a bit a number and doubling
+    while log not in files and len(files) < MOST_ATTEMPTS:
         header, streams = encode(field, render, steps, 2.0**log)
-        count = "" if limit is None else f", attempt {len(files) + 1}"
+        count = "" if limit == math.inf else f", attempt {len(files) + 1}"
         with progress(f"Encoding{count}", len(streams)) as advance:
             files[log] = container(header, streams, advance)
-        return total(len(files[log]))
-
-    log, size = 0.0, attempt(0.0)
-    if limit is None or size <= limit:
-        return files[log], 1.0
-    slope = (13 * len(field.splats["means"]) + field.splats["latents"].numel()) / 8  # a bit a number and doubling
-    while len(files) < MOST_ATTEMPTS and not ENOUGH * limit <= size <= limit:
+        size = total(len(files[log]))
+        if size <= limit and (log == 0.0 or size >= ENOUGH * limit):
+            break
+        if last is not None:
+            slope = max((last[1] - size) / (log - last[0]), 1.0)
         last = log, size
         log = min(max(log + (size - AIM * limit) / slope, 0.0), math.log2(COARSEST))
-        if log in files:
-            break
-        size = attempt(log)
-        slope = max((last[1] - size) / (log - last[0]), 1.0)
     fitting = [log for log, data in files.items() if total(len(data)) <= limit]
     if not fitting:
         raise too_small(limit, min(total(len(data)) for data in files.values()))

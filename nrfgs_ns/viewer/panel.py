@@ -63,16 +63,15 @@ class ViewerPanel(ViewerControl):
             self.legend = gui.add_markdown(self.legends[FULL])
             hint = "How much of the view dependence is added: 0 nothing, 1 as trained"
             self.gain = gui.add_slider("Residual gain", 0.0, 2.0, 0.05, 1.0, hint=hint)
-            self.look = None
-            if self.model.photograph is not None:
-                names = [MEAN_LOOK, *self.model.photograph.names]
-                self.look = gui.add_dropdown("Look", names, MEAN_LOOK, hint="The photograph whose exposure is shown")
+            self.photographs = [] if self.model.photograph is None else self.model.photograph.names
+            hint, looks = "The photograph whose exposure is shown", [MEAN_LOOK, *self.photographs]
+            self.look = gui.add_dropdown("Look", looks, MEAN_LOOK, visible=len(looks) > 1, hint=hint)
             hint = "Keep the appearance that the splats have from here, and walk around them"
             self.freeze = gui.add_checkbox("Freeze view", initial_value=False, hint=hint)
             self.count = gui.add_text("Splats", initial_value=f"{self.model.num_points:,}", disabled=True)
         # One callback each: viser runs a control's callbacks in no particular order.
         self.mode.on_update(lambda _: self._change_mode())
-        for control in filter(None, (self.gain, self.look)):
+        for control in (self.gain, self.look):
             control.on_update(lambda _: viewer._trigger_rerender())
         self.freeze.on_update(lambda event: self._freeze(event.client))
         viewer.viser_server.on_client_connect(self.welcome)
@@ -97,8 +96,7 @@ class ViewerPanel(ViewerControl):
     def options(self) -> PictureOptions:
         """The picture that the controls name."""
         center = self.frozen_center if self.freeze.value else None
-        of_mean = self.look is None or self.look.value == MEAN_LOOK
-        photograph = None if of_mean else self.model.photograph.names.index(self.look.value)
+        photograph = None if self.look.value == MEAN_LOOK else self.photographs.index(self.look.value)
         return PictureOptions(self.mode.value, float(self.gain.value), center, photograph)
 
     def render(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:

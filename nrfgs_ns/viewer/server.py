@@ -53,12 +53,10 @@ class LocalViewerConfig(ViewerConfig):
     everybody who reaches this machine can look and steer"""
 
 
+@functools.cache
 def protect() -> None:
     """Guard all viewers of this process from now on; InputError if viser is of an unknown version."""
-    if infra.WebsockServer is GuardedServer:
-        return
-    version = importlib.metadata.version("viser")
-    if version != VISER:
+    if (version := importlib.metadata.version("viser")) != VISER:
         raise InputError(f"viser {version}: the viewer is guarded in {VISER} alone. Run: pip install viser=={VISER}.")
     infra.WebsockServer = GuardedServer
     # The page is built. To ask, viser looks through all processes of the machine, and fails if one of them ends then.
@@ -191,24 +189,20 @@ class GuardedServer(infra.WebsockServer):
         if headers.get_all("Upgrade") == ["websocket"]:
             return None
         root = self._http_server_root.resolve()
-        try:
+        with contextlib.suppress(OSError, ValueError):  # too long, or not a path
             path = path.partition("?")[0]
             file = (root / path.removeprefix("/")).resolve()
             if path == "/" or (file.is_relative_to(root) and file.is_file()):
                 return None
-        except (OSError, ValueError):  # too long, or not a path
-            pass
         return HTTPStatus.NOT_FOUND, {}, b"404"
 
     def _known(self, host: str) -> bool:
         """Whether a Host header names this server. Every address does: no name server can redirect one."""
         try:
             name = urlsplit(f"//{host}").hostname or ""
+            return name in self.names or bool(ipaddress.ip_address(name))
         except ValueError:
             return False
-        with contextlib.suppress(ValueError):
-            return bool(ipaddress.ip_address(name))
-        return name in self.names
 
     def _admit(self, raw: bytes):
         """The message in some bytes, with what decides the size of a picture clamped; one without listeners for what no

@@ -4,7 +4,6 @@ high, and whose viser searches its archive of icons for every button, and import
 
 import functools
 import tarfile
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any, BinaryIO
@@ -25,22 +24,22 @@ SIDE = 100
 """Pixels of the shorter side as shown"""
 
 
+@functools.cache
 def open_sooner() -> None:
-    if _gui_api.svg_from_icon is not icon:
-        _gui_api.svg_from_icon = _gui_handles.svg_from_icon = icon
-        _scene_api.iio = SimpleNamespace(imwrite=_write)
-        wrap("init_scene", _init_with_small_photographs)
+    _gui_api.svg_from_icon = _gui_handles.svg_from_icon = icon
+    _scene_api.iio = SimpleNamespace(imwrite=_write)
+    wrap("init_scene", _init_with_small_photographs)
+
+
+def icon(name: str) -> str:
+    """`viser._icons.svg_from_icon`, with the archive read once."""
+    return _archived()[f"{name}.svg"].decode("utf-8")
 
 
 @functools.cache
-def icon(name: str) -> str:
-    """`viser._icons.svg_from_icon`, with the archive opened once."""
-    with _ARCHIVE_LOCK:
-        return _archive().extractfile(f"{name}.svg").read().decode("utf-8")
-
-
-_ARCHIVE_LOCK = threading.Lock()
-_archive = functools.cache(lambda: tarfile.open(_icons.ICONS_DIR / "tabler-icons.tar"))
+def _archived() -> dict[str, bytes]:
+    with tarfile.open(_icons.ICONS_DIR / "tabler-icons.tar") as archive:
+        return {member.name: archive.extractfile(member).read() for member in archive}
 
 
 def _write(file: BinaryIO, image: np.ndarray, extension: str, **options: Any) -> None:
