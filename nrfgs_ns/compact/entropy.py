@@ -85,6 +85,12 @@ MOST_MODEL = 2 + PREDICTORS + ACTIVITY + 1 + MOST_CONTEXTS * (3 + TOKENS)
 """Largest number of integers that describe a column."""
 
 
+def expect(right: bool, otherwise: str) -> None:
+    """Raise ValueError, which says what a file is otherwise, unless it is right."""
+    if not right:
+        raise ValueError(otherwise)
+
+
 class _Lanes:
     """The layout of a table [C, n] in coding order: [2 + C, 2 + S, lanes], with zeros before the first column, before
     each lane's first row and behind the last row."""
@@ -249,12 +255,10 @@ def _coded(lanes: _Lanes, frequencies: Array, starts: Array, spares: Array, lows
 def decode_table(model: Array, data: bytes, columns: int, rows: int) -> Array:
     """Decode a table, int64 [C, n]; ValueError for an impossible model, and missing or spare words."""
     lanes = _Lanes(columns, rows)
-    if len(data) < 4 * lanes.lanes or len(data) % 2:
-        raise ValueError("too few bytes for its lanes")
+    expect(len(data) >= 4 * lanes.lanes and len(data) % 2 == 0, "too few bytes for its lanes")
     state = np.frombuffer(data, "<u4", lanes.lanes).astype(np.int64)
     words = np.frombuffer(data, "<u2", offset=4 * lanes.lanes).astype(np.int64)
-    if (state < LOWEST).any():
-        raise ValueError("a state is too small")
+    expect((state >= LOWEST).all(), "a state is too small")
     laid, tokens = lanes.zeros(2 + columns), lanes.zeros(3)  # tokens of a column and of the two to its left, in turn
     at = 0
     for column, part in enumerate(_read_model(model, columns)):
@@ -289,10 +293,8 @@ def decode_table(model: Array, data: bytes, columns: int, rows: int) -> Array:
                 expected = (base[step, :count] + w1 * own[step + 1, :count] + w2 * own[step, :count]) >> SHIFT
                 unsigned = expected + ((unsigned >> 1) ^ -(unsigned & 1))
             own[step + 2, :count] = unsigned
-        if (np.abs(own) >= LARGEST).any():
-            raise ValueError("a number is too large")
-    if at != len(words) or (state != LOWEST).any():
-        raise ValueError("it does not end where its table does")
+        expect((np.abs(own) < LARGEST).all(), "a number is too large")
+    expect(at == len(words) and (state == LOWEST).all(), "it does not end where its table does")
     return lanes.table(laid)
 
 
@@ -302,8 +304,7 @@ def _refilled(x: Array, words: Array, at: int) -> tuple[Array, int]:
     if low.size == 0:
         return x, at
     end = at + low.size
-    if end > len(words):
-        raise ValueError("it is cut short")
+    expect(end <= len(words), "it is cut short")
     x[low] = (x[low] << WORD) | words[at:end]
     return x, end
 
@@ -328,26 +329,23 @@ def _read_model(model: Array, columns: int) -> Iterator[_Column]:
     def take(count: int) -> Array:
         nonlocal at
         at += count
-        if count < 0 or at > len(numbers):
-            raise ValueError("its model is cut short")
+        expect(count >= 0 and at <= len(numbers), "its model is cut short")
         return numbers[at - count : at]
-
-    def hold(possible: bool) -> None:
-        if not possible:
-            raise ValueError("its model is impossible")
 
     for _ in range(columns):
         signed, *weights = take(2 + PREDICTORS).tolist()
         *shares, count = take(ACTIVITY + 1).tolist()
         thresholds = take(count)
-        hold(count < MOST_CONTEXTS and (np.diff(thresholds) > 0).all())
-        hold(max(map(abs, weights)) <= LARGEST_WEIGHT and 0 <= min(shares) and max(shares) <= LARGEST_SHARE)
+        possible = count < MOST_CONTEXTS and (np.diff(thresholds) > 0).all()
+        possible &= max(map(abs, weights)) <= LARGEST_WEIGHT and 0 <= min(shares) and max(shares) <= LARGEST_SHARE
+        expect(possible, "its model is impossible")
         table = np.zeros((count + 1, TOKENS), dtype=np.int64)
         for frequencies in table:
             first, used = take(2).tolist()
-            hold(0 <= first and 0 < used and first + used <= TOKENS)
+            expect(0 <= first and 0 < used and first + used <= TOKENS, "its model has impossible tokens")
             frequencies[first : first + used] = take(used)
-        hold((table >= 0).all() and (table.sum(axis=1) == 1 << PRECISION).all())
+        possible = (table >= 0).all() and (table.sum(axis=1) == 1 << PRECISION).all()
+        expect(possible, "its model has impossible frequencies")
         starts = np.cumsum(table, axis=1) - table
         tokens = np.repeat(np.tile(np.arange(TOKENS), count + 1), table.ravel())
         slots = np.arange(len(tokens)) & ((1 << PRECISION) - 1)
@@ -355,5 +353,4 @@ def _read_model(model: Array, columns: int) -> Iterator[_Column]:
         offsets = slots - np.repeat(starts.ravel(), table.ravel())
         frequencies = np.repeat(table.ravel(), table.ravel())
         yield _Column(bool(signed), weights, shares, contexts, tokens, frequencies, offsets)
-    if at != len(numbers):
-        raise ValueError("its model does not end where its table does")
+    expect(at == len(numbers), "its model does not end where its table does")

@@ -5,10 +5,8 @@ A model with a panel (`viewer_panel`) follows it only in the viewer's render thr
 cannot reach a training, an evaluation or ns-render.
 """
 
-import contextlib
 import sys
 import threading
-from collections.abc import Iterator
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -27,18 +25,6 @@ STEP_FORWARD = 5.0
 """Distance of a browser's first view in front of the first photograph, in sizes of the frustums that mark photographs.
 Frustums of 30 degrees and more then lie behind it."""
 MEAN_LOOK = "all photographs' mean"
-
-
-@contextlib.contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Suspend nerfstudio's trace function, which interrupts a rendering by an exception at any line: inside viser that
-    would leave a lock taken."""
-    trace = sys.gettrace()
-    sys.settrace(None)
-    try:
-        yield
-    finally:
-        sys.settrace(trace)
 
 
 class ViewerPanel(ViewerControl):
@@ -101,22 +87,28 @@ class ViewerPanel(ViewerControl):
 
     def render(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
         """Render one camera, a batch of one, as the controls say (`picture`)."""
-        with uninterrupted():
-            if self.count.value != (count := f"{self.model.num_points:,}"):
-                self.count.value = count
         # As in nerfstudio, the viewer's background is used where the configuration leaves it open.
         background = self.background if self.model.config.background_color == "random" else None
         self.model.set_crop(obb_box)
+        trace = sys.gettrace()  # nerfstudio's, which interrupts a rendering by an exception at any line
+        if not self.is_slow:
+            sys.settrace(None)
         try:
-            with contextlib.nullcontext() if self.is_slow else uninterrupted():
-                return picture(self.model, camera, self.options, background)
+            return picture(self.model, camera, self.options, background)
         finally:
             self.model.set_crop(None)
+            if not self.is_slow:
+                sys.settrace(trace)
 
     @property
     def is_slow(self) -> bool:
         """Whether pictures may be interrupted. On a GPU an interrupted trial of a kernel would count as failed."""
         return self.model.device.type == "cpu"
+
+    def update_count(self) -> None:
+        """Show the number of splats. Not while rendering: an interruption inside viser would leave a lock taken."""
+        if self.count.value != (count := f"{self.model.num_points:,}"):
+            self.count.value = count
 
     def _change_mode(self) -> None:
         self.legend.content = self.legends[self.mode.value]

@@ -97,8 +97,9 @@ def _open_guarded(open_viewer: Callable[..., None], viewer: Viewer, config, *arg
 
 def _update_without_exceptions(update_scene: Callable[..., None], viewer: Viewer, step: int, *args, **options) -> None:
     """Update the scene, as a training does after each step: a browser that leaves, or whose camera is odd, must not end
-    it. Also show the step of a training that is over."""
+    it. Also show the number of splats, and the step of a training that is over."""
     with contextlib.suppress(Exception):
+        viewer.pipeline.model.viewer_panel.update_count()
         if viewer.trainer is None:
             viewer.update_step(step)
         update_scene(viewer, step, *args, **options)
