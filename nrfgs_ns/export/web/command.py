@@ -13,8 +13,6 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from PIL import Image
 
-from nrfgs_ns.appearance.nrf import NeuralResidualField
-from nrfgs_ns.appearance.reduce import branches
 from nrfgs_ns.data.pictures import picture_names
 from nrfgs_ns.data.views import evenly_spaced, in_view
 from nrfgs_ns.errors import InputError
@@ -29,8 +27,6 @@ from nrfgs_ns.trained.loading import finish, lost
 
 POSTER_SIDE = 960
 """Longest side of the poster, pixels."""
-MOST_WEIGHTS = 1024
-"""Vectors of four that a uniform block holds on every device with WebGL 2 (16 KiB)."""
 MOST_POINTS = 20_000
 """Splats from which a photograph's distance to its subject is estimated."""
 
@@ -45,12 +41,7 @@ def export_web(load_config: Path, options: Web) -> None:
         names = picture_names(pipeline.datamanager.train_dataset.image_filenames)
         guide = {"tour": read_tour(options.tour, names), "notes": read_notes(options.notes), "rotate": options.rotate}
         threads.suit_to(pipeline)
-        if (vectors := weight_vectors(pipeline.model.head)) > MOST_WEIGHTS:
-            raise InputError(
-                f"{load_config}: the field's weights fill {vectors} vectors of a shader, and some phones have room for "
-                f"{MOST_WEIGHTS}. Train with a smaller hidden_width, or fewer num_bands."
-            )
-        about, poster = surroundings(pipeline)
+        about, poster = surroundings(pipeline, names)
         title = output.stem if options.title is None else options.title
         picture = output.with_suffix(".jpg") if alone else output / "preview.jpg"
         preview = "" if address is None else urljoin(address if alone else f"{address}/", picture.name)
@@ -76,18 +67,8 @@ def export_web(load_config: Path, options: Web) -> None:
     finish(lines, numbers | {"bytes": size, "scene_bytes": len(scene), "start": name}, options.report)
 
 
-def weight_vectors(head: NeuralResidualField) -> int:
-    """Vectors of four that the page's shader reads for a view (`viewWeights` in field.js)."""
-    total = 0
-    for name in branches(head.state_dict()):
-        units, inputs = getattr(head, name)[0].weight.shape
-        of_splat = head.config.latent_dim + 3 + (name == "low")  # latents, base colour, base opacity
-        total += -(-units // 4) * (inputs - of_splat + 4) + 1
-    return total
-
-
 @torch.no_grad()
-def surroundings(pipeline) -> tuple[dict[str, Any], bytes]:
+def surroundings(pipeline, names: list[str]) -> tuple[dict[str, Any], bytes]:
     """The scripts' values besides the scene, and a JPEG of the training view at which the page begins: the one that the
     model draws best (PSNR) of at most eight, evenly spaced.
 
@@ -120,7 +101,7 @@ def surroundings(pipeline) -> tuple[dict[str, Any], bytes]:
             "size": [int(cameras.width[i]), int(cameras.height[i])],
             "distance": distances[i] or typical,
         }
-        for i, name in enumerate(picture_names(data.train_dataset.image_filenames))
+        for i, name in enumerate(names)
     ]
     return {"photographs": photographs, "start": start, "up": _rounded(up)}, _jpeg(poster)
 
