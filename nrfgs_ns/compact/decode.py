@@ -22,7 +22,6 @@ LONGEST_REASON = 200
 """Characters of a message that may quote the file."""
 WIDTHS = dict(zip(COLUMNS, (1, 3, 3, 3), strict=True))
 """Columns of each table in the stream "splats"."""
-HEADER = ("format", "splats", "head", "render", "grids", "streams")
 TABLES = {"means": ("uint32",), "splats": ("int16", "int32"), "latents": ("int16", "int32")}
 """Coded tables, and the types of their numbers."""
 LARGEST = 1e18
@@ -47,7 +46,7 @@ def decode(path: Path) -> Decoded:
     try:
         expect(path.is_file(), "it is no file")
         header, first = read_header(data := path.read_bytes())
-        check_keys(header, HEADER, "the header")
+        check_keys(header, ("format", "splats", "head", "render", "grids", "streams"), "the header")
         check_keys(header["head"], ("name", "config", "scene_unit"), "the head")
         content, name = header["format"], header["head"]["name"]
         expect(content == FORMAT and name == "nrf", f"it holds {content!r} with a head named {name!r}")

@@ -252,7 +252,6 @@ def fine_tune(
     """
     model, data = pipeline.model, pipeline.datamanager
     cameras = data.train_dataset.cameras
-    view_count = len(cameras)
     noise = ViewNoise(model.noise_factor * camera_spacing(cameras.camera_to_worlds[:, :3, 3]), torch.initial_seed())
     field = model.field.detached()
     # Latents begin as their own principal components.
@@ -284,7 +283,7 @@ def fine_tune(
             with torch.no_grad():
                 tables = coded(rounded=True)
                 cost = coded.bits(tables) * (WORTH * of_bits)
-            views = map(data.next_train, range(view_count))
+            views = map(data.next_train, range(len(cameras)))
             growth, loss = growth_without(model, Field(head, splats_of(tables)), views)
             # The training's loss is about the root of the squared error.
             kept = (turns != prunings.index(step)) | (0.5 * loss * growth > cost)

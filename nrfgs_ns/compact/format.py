@@ -34,7 +34,7 @@ import lzma
 import math
 import struct
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -62,8 +62,6 @@ LARGEST_MEMORY = 2**28
 """Bytes that xz may take to unpack: more than the dictionary needs."""
 ONE_BLOCK = b"\x02\x00\x21\x01"
 """How the header of a block begins: its length, no sizes, LZMA2, one byte of properties."""
-ENTRY = ("name", "coding", "dtype", "shape", "bytes", "crc32")
-"""Keys of an entry of "streams"."""
 BROKEN = OSError, LookupError, TypeError, ValueError, AttributeError, OverflowError, RuntimeError
 BROKEN += lzma.LZMAError, struct.error
 """Errors of reading a damaged or hostile file."""
@@ -78,15 +76,12 @@ class Table(NamedTuple):
     """from -2^31 to 2^31 - 1, and like their neighbours; False: from 0 to 2^32 - 1"""
 
 
-def container(
-    header: Mapping[str, Any], streams: Mapping[str, np.ndarray | Table], advance: Callable[[], None] = lambda: None
-) -> bytes:
+def container(header: Mapping[str, Any], streams: Mapping[str, np.ndarray | Table]) -> bytes:
     """The bytes of a file.
 
     Args:
         header: what JSON can hold; "streams" is added.
         streams: arrays of DTYPES, and tables.
-        advance: called after each stream.
     """
     entries, bodies = [], []
     for name, stream in streams.items():
@@ -95,7 +90,6 @@ def container(
         sizes = {"dtype": array.dtype.name, "shape": list(array.shape), "bytes": len(body)}
         entries.append({"name": name, "coding": coding, **sizes, "crc32": zlib.crc32(body)})
         bodies.append(body)
-        advance()
     text = json.dumps({**header, "streams": entries}, allow_nan=False).encode("utf-8")
     total = PREAMBLE.size + len(text) + CHECKSUM.size + sum(map(len, bodies))
     start = PREAMBLE.pack(MAGIC, VERSION, len(text), total) + text
@@ -119,7 +113,8 @@ def read_streams(data: bytes, entries: list[dict[str, Any]], first: int) -> dict
     unpacked = 0
     streams = {}
     for entry in entries:
-        check_keys(entry, ENTRY, named := f"the stream {ascii(entry)}")
+        named = f"the stream {ascii(entry)}"
+        check_keys(entry, ("name", "coding", "dtype", "shape", "bytes", "crc32"), named)
         sizes = entry["shape"]
         kinds = type(entry["name"]), type(sizes), type(entry["bytes"])
         expect(kinds == (str, list, int) and entry["dtype"] in CODINGS[entry["coding"]], named)

@@ -145,10 +145,8 @@ def encoded(
     log, last = 0.0, None
     slope = (13 * len(field.splats["means"]) + field.splats["latents"].numel()) / 8  # a bit a number and doubling
     while log not in files and len(files) < MOST_ATTEMPTS:
-        header, streams = encode(field, render, steps, 2.0**log)
-        count = "" if limit == math.inf else f", attempt {len(files) + 1}"
-        with progress(f"Encoding{count}", len(streams)) as advance:
-            files[log] = container(header, streams, advance)
+        with progress("Encoding" if limit == math.inf else f"Encoding, attempt {len(files) + 1}"):
+            files[log] = container(*encode(field, render, steps, 2.0**log))
         size = total(len(files[log]))
         if size <= limit and (log == 0.0 or size >= ENOUGH * limit):
             break

@@ -117,10 +117,7 @@ def with_gain(field: Field, view: View, gain: float) -> SplatAppearance:
     base appearance."""
     if gain == 1.0:
         return field.seen_from(view)
-    base = field.base_of(view)
-    if gain == 0.0:
-        return base
-    trained = field.seen_from(view)
+    base, trained = field.base_of(view), field.seen_from(view)
     colors = base.colors + gain * (trained.colors - base.colors)
     return SplatAppearance(
         colors=colors if field.head.at_pixel else colors.clamp_min(0.0),
