@@ -66,11 +66,7 @@ def load_field(load_config: Path, measured: bool) -> NrfgsPipeline:
 
 
 def write_file(
-    pipeline,
-    load_config: Path,
-    output: Path,
-    options: Compact,
-    total: Callable[[int], int] = lambda size: size,
+    pipeline, load_config: Path, output: Path, options: Compact, total: Callable[[int], int] = lambda size: size
 ) -> tuple[Path, dict[str, Any]]:
     """Write a compact file; returns the config.yml with which nerfstudio reads it, and numbers for a report.
 
