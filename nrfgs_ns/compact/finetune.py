@@ -28,7 +28,7 @@ from torch import Tensor, nn
 from torch.nn.functional import logsigmoid
 
 from nrfgs_ns.appearance.head import Field, SplatAppearance, ViewNoise, VisibleSplats
-from nrfgs_ns.appearance.reduce import build, latent_basis, with_components, with_rank
+from nrfgs_ns.appearance.reduce import latent_basis, with_components, with_rank
 from nrfgs_ns.compact.encode import drawable
 from nrfgs_ns.compact.tables import COLUMNS, MOST_BITS, Grid, morton, splats_of, steps_of, tables_of
 from nrfgs_ns.data.views import camera_spacing
@@ -256,7 +256,7 @@ def fine_tune(
     field = model.field.detached()
     # Latents begin as their own principal components.
     field = with_rank(field, latent_basis(field, contributions_to(model, cameras)), field.head.config.latent_dim)
-    head = build(field.head.config, field.head.state_dict(), field.head.scene_unit).requires_grad_(True).train()
+    head = field.head.requires_grad_(True).train()
     splats = drawable(field.splats)
     coded = CodedSplats(splats)
     count = len(splats["means"])

@@ -168,8 +168,7 @@ class GuardedServer(infra.WebsockServer):
         """`websockets.server.serve` of requests that are not refused."""
 
         async def answer(path: str, headers):
-            refusal = self._refusal(path, headers)
-            return await process_request(path, headers) if refusal is None else refusal
+            return self._refusal(path, headers) or await process_request(path, headers)
 
         async def handle(websocket) -> None:
             async def recv() -> bytes:  # viser fails on messages of text
