@@ -257,9 +257,8 @@ def fine_tune(
     # Latents begin as their own principal components.
     field = with_rank(field, latent_basis(field, contributions_to(model, cameras)), field.head.config.latent_dim)
     head = field.head.requires_grad_(True).train()
-    splats = drawable(field.splats)
-    coded = CodedSplats(splats)
-    count = len(splats["means"])
+    coded = CodedSplats(drawable(field.splats))
+    count = len(coded.tables["means"].values)
     of_bits = torch.tensor(rate / (8 * count), device=model.device)  # loss of a bit
     smallest, largest = (limit / (8 * count) for limit in RATES_FOR_SIZE)
     haste = min(HASTE * EVERY / steps, HASTIEST)
