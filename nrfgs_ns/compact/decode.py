@@ -11,6 +11,7 @@ from torch import Tensor
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.reduce import build
 from nrfgs_ns.compact.encode import FORMAT
+from nrfgs_ns.compact.entropy import expect
 from nrfgs_ns.compact.format import BROKEN, check_keys, read_header, read_streams
 from nrfgs_ns.compact.tables import COLUMNS, Grid, from_morton, splats_of
 from nrfgs_ns.errors import InputError
@@ -21,7 +22,6 @@ LONGEST_REASON = 200
 """Characters of a message that may quote the file."""
 WIDTHS = dict(zip(COLUMNS, (1, 3, 3, 3), strict=True))
 """Columns of each table in the stream "splats"."""
-HEADER = ("format", "splats", "head", "render", "grids", "streams")
 TABLES = {"means": ("uint32",), "splats": ("int16", "int32"), "latents": ("int16", "int32")}
 """Coded tables, and the types of their numbers."""
 LARGEST = 1e18
@@ -44,13 +44,12 @@ class Decoded(NamedTuple):
 def decode(path: Path) -> Decoded:
     """Read a compact file; InputError if it breaks a rule of docs/compact-format.md."""
     try:
-        if not path.is_file():
-            raise ValueError("it is no file")
+        expect(path.is_file(), "it is no file")
         header, first = read_header(data := path.read_bytes())
-        check_keys(header, HEADER, "the header")
+        check_keys(header, ("format", "splats", "head", "render", "grids", "streams"), "the header")
         check_keys(header["head"], ("name", "config", "scene_unit"), "the head")
-        if header["format"] != FORMAT or header["head"]["name"] != "nrf":
-            raise ValueError(f"it holds {header['format']!r} with a head named {header['head']['name']!r}")
+        content, name = header["format"], header["head"]["name"]
+        expect(content == FORMAT and name == "nrf", f"it holds {content!r} with a head named {name!r}")
         config = _config(header["head"])
         _check_render(header["render"])
         grids = _grids(header["grids"], config.latent_dim)
@@ -59,8 +58,7 @@ def decode(path: Path) -> Decoded:
         heads = {name: stream.astype(np.float32) for name, stream in streams.items() if name.startswith("head.")}
         weights = {name.removeprefix("head."): torch.from_numpy(stream) for name, stream in heads.items()}
         build(config, weights, header["head"]["scene_unit"])  # RuntimeError for weights of other names and shapes
-        if not all(weight.isfinite().all() for weight in weights.values()):
-            raise ValueError("the head's weights are not finite")
+        expect(all(weight.isfinite().all() for weight in weights.values()), "the head's weights are not finite")
         return Decoded(config, weights, _splats(header["splats"], grids, streams), header)
     except BROKEN as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:LONGEST_REASON]
@@ -76,37 +74,34 @@ def _config(head: dict[str, Any]) -> NrfConfig:
     options = {}
     for name, value in head["config"].items():
         kind = type(getattr(usual, name))
-        if not (_is_number(value, -LARGEST, LARGEST) if kind is float else type(value) is kind):
-            raise ValueError(f"the head's {name} is {ascii(value)}")
+        right = _is_number(value, -LARGEST, LARGEST) if kind is float else type(value) is kind
+        expect(right, f"the head's {name} is {ascii(value)}")
         options[name] = kind(value)
     config = NrfConfig(**options)
     config.validate()
-    if config.num_bands > MOST_BANDS:
-        raise ValueError(f"the head has {config.num_bands} bands")
-    if not _is_number(head["scene_unit"], 1 / LARGEST, LARGEST):
-        raise ValueError(f"the head's scene_unit is {ascii(head['scene_unit'])}")
+    expect(config.num_bands <= MOST_BANDS, f"the head has {config.num_bands} bands")
+    unit = head["scene_unit"]
+    expect(_is_number(unit, 1 / LARGEST, LARGEST), f"the head's scene_unit is {ascii(unit)}")
     return config
 
 
 def _check_render(render: dict[str, Any]) -> None:
     check_keys(render, ("rasterize_mode", "background"), "render", optional=("near_plane",))
     mode, background, near = render["rasterize_mode"], render["background"], render.get("near_plane", 0)
-    if mode not in ("classic", "antialiased"):
-        raise ValueError(f"it is rendered by {ascii(mode)}")
-    if type(background) is not list or len(background) != 3 or not all(_is_number(c, 0, 1) for c in background):
-        raise ValueError(f"its background is {ascii(background)}")
-    if not _is_number(near, 0, LARGEST):
-        raise ValueError(f"the near plane is {ascii(near)}")
+    expect(mode in ("classic", "antialiased"), f"it is rendered by {ascii(mode)}")
+    is_color = type(background) is list and len(background) == 3 and all(_is_number(c, 0, 1) for c in background)
+    expect(is_color, f"its background is {ascii(background)}")
+    expect(_is_number(near, 0, LARGEST), f"the near plane is {ascii(near)}")
 
 
 def _check_kinds(entries: list[dict[str, Any]]) -> None:
     """Raise ValueError unless the streams are the three tables and weights, in codings and types that suit them."""
     kinds = {entry["name"]: (entry["coding"], entry["dtype"]) for entry in entries}
-    if (tables := {name for name in kinds if not name.startswith("head.")}) != set(TABLES):
-        raise ValueError(f"its tables are {ascii(sorted(tables))} instead of {sorted(TABLES)}")
+    tables = {name for name in kinds if not name.startswith("head.")}
+    expect(tables == set(TABLES), f"its tables are {ascii(sorted(tables))} instead of {sorted(TABLES)}")
     for name, (coding, dtype) in kinds.items():
-        if coding != ("rans" if name in TABLES else "xz") or dtype not in TABLES.get(name, ("float16", "float32")):
-            raise ValueError(f"{name} is of {coding} and {dtype}")
+        right = coding == ("rans" if name in TABLES else "xz") and dtype in TABLES.get(name, ("float16", "float32"))
+        expect(right, f"{name} is of {coding} and {dtype}")
 
 
 def _grids(grids: dict[str, Any], latent_dim: int) -> dict[str, Grid]:
@@ -116,23 +111,20 @@ def _grids(grids: dict[str, Any], latent_dim: int) -> dict[str, Grid]:
     for name, count in counts.items():
         check_keys(grids[name], ("low", "step"), f"the grid of {name}")
         lists = [grids[name][part] for part in ("low", "step")]
-        if not all(type(row) is list and len(row) == count and {*map(type, row)} <= {int, float} for row in lists):
-            raise ValueError(f"the grid of {name} is not {count} numbers")
+        right = all(type(row) is list and len(row) == count and {*map(type, row)} <= {int, float} for row in lists)
+        expect(right, f"the grid of {name} is not {count} numbers")
         read[name] = Grid(*np.array(lists, dtype=np.float64))
-        if not (read[name].step > 0).all():
-            raise ValueError(f"the grid of {name} has steps that are not positive")
+        expect((read[name].step > 0).all(), f"the grid of {name} has steps that are not positive")
     return read
 
 
 def _splats(count: Any, grids: dict[str, Grid], streams: dict[str, np.ndarray]) -> dict[str, Tensor]:
-    if type(count) is not int or count < 1:
-        raise ValueError(f"{ascii(count)} splats")
+    expect(type(count) is int and count > 0, f"{ascii(count)} splats")
     for name, columns in {"means": 2, "splats": sum(WIDTHS.values()), "latents": len(grids["latents"].step)}.items():
-        if streams[name].shape != (columns, count):
-            raise ValueError(f"{name} of shape {list(streams[name].shape)} instead of {[columns, count]}")
+        shape = streams[name].shape
+        expect(shape == (columns, count), f"{name} of shape {list(shape)} instead of {[columns, count]}")
     upper, lower = streams["means"].astype(np.uint64)
-    if upper.max(initial=0) >= 2**31:
-        raise ValueError("means beyond 63 bits")
+    expect(upper.max() < 2**31, "means beyond 63 bits")
     places = np.cumsum((upper << np.uint64(32)) | lower, dtype=np.uint64)
     codes = {"means": from_morton(places), "latents": streams["latents"].T}
     codes |= zip(WIDTHS, np.split(streams["splats"].T, np.cumsum([*WIDTHS.values()])[:-1], axis=1), strict=True)
@@ -141,8 +133,7 @@ def _splats(count: Any, grids: dict[str, Grid], streams: dict[str, np.ndarray]) 
     values["latents"] = values["latents"].float()  # the largest table by far, and no rotations to work out
     splats = {name: value.float() for name, value in splats_of(values).items()}
     for name, value in splats.items():
-        if not torch.isfinite(value).all():
-            raise ValueError(f"{name} beyond float32")
+        expect(torch.isfinite(value).all(), f"{name} beyond float32")
     return splats
 
 

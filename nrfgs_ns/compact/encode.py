@@ -68,8 +68,7 @@ def encode(
     """
     tables = tables_of(drawable(field.splats))
     tables["opacities"] = tables["opacities"].clamp(-LARGEST_LOGIT, LARGEST_LOGIT)
-    steps = steps_of(tables) if steps is None else steps
-    steps = {name: coarser * step for name, step in steps.items()}
+    steps = {name: coarser * step for name, step in (steps or steps_of(tables)).items()}
     needed = np.ptp(tables["means"].cpu().numpy(), axis=0) / (2**MOST_BITS - 1)
     if (needed > steps["means"]).any():
         warn(

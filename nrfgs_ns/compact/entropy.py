@@ -85,8 +85,10 @@ MOST_MODEL = 2 + PREDICTORS + ACTIVITY + 1 + MOST_CONTEXTS * (3 + TOKENS)
 """Largest number of integers that describe a column."""
 
 
-class BadStream(ValueError):
-    """A stream that no encoder wrote."""
+def expect(right: bool, otherwise: str) -> None:
+    """Raise ValueError, which says what a file is otherwise, unless it is right."""
+    if not right:
+        raise ValueError(otherwise)
 
 
 class _Lanes:
@@ -128,9 +130,8 @@ def encode_table(table: Array, signed: bool = True) -> tuple[Array, bytes]:
     lanes = _Lanes(columns, rows)
     laid, tokens = lanes.laid(table), lanes.zeros(2 + columns)
     real = lanes.laid(np.ones((1, rows)))[2, 2:].astype(bool)
-    spares, lows, contexts = np.zeros((3, columns, *real.shape), dtype=np.int64)
+    spares, lows, frequencies, starts = np.zeros((4, columns, *real.shape), dtype=np.int64)
     model: list[int] = []
-    frequencies = []
     for column in range(columns):
         numbers = laid[2 + column, 2:]
         weights, prediction = _fitted_prediction(*laid[column : column + 3], real) if signed else NO_PREDICTION
@@ -144,15 +145,18 @@ def encode_table(table: Array, signed: bool = True) -> tuple[Array, bytes]:
         far = DIRECT + 4 * (bits - 5) + ((unsigned >> spares[column]) & 3)
         tokens[2 + column, 2:] = np.where(unsigned < DIRECT, unsigned, far)
         lows[column] = unsigned & ((1 << spares[column]) - 1)
-        shares, thresholds, contexts[column] = _fitted_contexts(*tokens[column : column + 3], real)
+        shares, thresholds, contexts = _fitted_contexts(*tokens[column : column + 3], real)
         model += [int(signed), *weights, *shares, len(thresholds), *thresholds]
-        places = contexts[column] * TOKENS + tokens[2 + column, 2:]
+        places = contexts * TOKENS + tokens[2 + column, 2:]
         counts = np.bincount(places[real], minlength=(len(thresholds) + 1) * TOKENS).reshape(-1, TOKENS)
-        frequencies.append(np.array([_normalised(row) for row in counts]))
-        for row in frequencies[-1]:
+        table = np.array([_normalised(row) for row in counts])
+        for row in table:
             used = np.flatnonzero(row)
             model += [used[0], used[-1] - used[0] + 1, *row[used[0] : used[-1] + 1]]
-    return np.array(model, dtype=np.int32), _coded(lanes, frequencies, contexts, tokens[2:, 2:], spares, lows)
+        frequencies[column] = table.take(places)
+        starts[column] = (np.cumsum(table, axis=1) - table).take(places)
+    coded = _coded(lanes, *np.stack([frequencies, starts]).astype(np.uint64), spares, lows)
+    return np.array(model, dtype=np.int32), coded
 
 
 def _least_squares(inputs: list[Array], target: Array, real: Array, relative: float, absolute: float) -> Array:
@@ -215,9 +219,8 @@ def _normalised(counts: Array) -> Array:
     return shares
 
 
-def _coded(
-    lanes: _Lanes, frequencies: list[Array], contexts: Array, tokens: Array, spares: Array, lows: Array
-) -> bytes:
+def _coded(lanes: _Lanes, frequencies: Array, starts: Array, spares: Array, lows: Array) -> bytes:
+    """The coder's bytes of tokens, by their frequencies and starts, and of their low bits, `spares` in number."""
     state = np.full(lanes.lanes, LOWEST, dtype=np.uint64)
     chunks: list[Array] = []
 
@@ -230,26 +233,19 @@ def _coded(
         return x
 
     for column in reversed(range(lanes.columns)):
-        table = frequencies[column]
-        starts = np.cumsum(table, axis=1) - table
-        f = table[contexts[column], tokens[column]].astype(np.uint64)
-        start = starts[contexts[column], tokens[column]].astype(np.uint64)
-        limits = f << np.uint64(32 - PRECISION)
-        most = spares[column].max(axis=1)
         for step in reversed(range(lanes.steps)):
             count = lanes.active(step)
             x = state[:count]
-            if most[step] > 0:
-                spare, low = spares[column, step, :count], lows[column, step, :count]
-                for shift in (WORD, 0) if most[step] > WORD else (0,):  # the lower 16 bits are read first
+            spare, low = spares[column, step, :count], lows[column, step, :count]
+            if (most := spare.max()) > 0:
+                for shift in (WORD, 0) if most > WORD else (0,):  # the lower 16 bits are read first
                     bits = (spare - shift).clip(0, WORD).astype(np.uint64)
                     x = push(x, np.uint64(1) << (np.uint64(32) - bits))
                     x = (x << bits) | ((low >> shift).astype(np.uint64) & ((np.uint64(1) << bits) - np.uint64(1)))
-            fs = f[step, :count]
-            x = push(x, limits[step, :count])
-            quotient = x // fs
-            x = (quotient << np.uint64(PRECISION)) + (x - quotient * fs) + start[step, :count]
-            state[:count] = x
+            frequency, start = frequencies[column, step, :count], starts[column, step, :count]
+            x = push(x, frequency << np.uint64(32 - PRECISION))
+            quotient = x // frequency
+            state[:count] = (quotient << np.uint64(PRECISION)) + (x - quotient * frequency) + start
     return state.astype("<u4").tobytes() + b"".join(chunk.tobytes() for chunk in reversed(chunks))
 
 
@@ -257,14 +253,12 @@ def _coded(
 
 
 def decode_table(model: Array, data: bytes, columns: int, rows: int) -> Array:
-    """Decode a table, int64 [C, n]; BadStream for an impossible model, and missing or spare words."""
+    """Decode a table, int64 [C, n]; ValueError for an impossible model, and missing or spare words."""
     lanes = _Lanes(columns, rows)
-    if len(data) < 4 * lanes.lanes or len(data) % 2:
-        raise BadStream("too few bytes for its lanes")
+    expect(len(data) >= 4 * lanes.lanes and len(data) % 2 == 0, "too few bytes for its lanes")
     state = np.frombuffer(data, "<u4", lanes.lanes).astype(np.int64)
     words = np.frombuffer(data, "<u2", offset=4 * lanes.lanes).astype(np.int64)
-    if (state < LOWEST).any():
-        raise BadStream("a state is too small")
+    expect((state >= LOWEST).all(), "a state is too small")
     laid, tokens = lanes.zeros(2 + columns), lanes.zeros(3)  # tokens of a column and of the two to its left, in turn
     at = 0
     for column, part in enumerate(_read_model(model, columns)):
@@ -299,10 +293,8 @@ def decode_table(model: Array, data: bytes, columns: int, rows: int) -> Array:
                 expected = (base[step, :count] + w1 * own[step + 1, :count] + w2 * own[step, :count]) >> SHIFT
                 unsigned = expected + ((unsigned >> 1) ^ -(unsigned & 1))
             own[step + 2, :count] = unsigned
-        if (np.abs(own) >= LARGEST).any():
-            raise BadStream("a number is too large")
-    if at != len(words) or (state != LOWEST).any():
-        raise BadStream("it does not end where its table does")
+        expect((np.abs(own) < LARGEST).all(), "a number is too large")
+    expect(at == len(words) and (state == LOWEST).all(), "it does not end where its table does")
     return lanes.table(laid)
 
 
@@ -312,8 +304,7 @@ def _refilled(x: Array, words: Array, at: int) -> tuple[Array, int]:
     if low.size == 0:
         return x, at
     end = at + low.size
-    if end > len(words):
-        raise BadStream("it is cut short")
+    expect(end <= len(words), "it is cut short")
     x[low] = (x[low] << WORD) | words[at:end]
     return x, end
 
@@ -332,37 +323,34 @@ class _Column(NamedTuple):
 
 
 def _read_model(model: Array, columns: int) -> Iterator[_Column]:
-    """The columns of a model, one after the other; BadStream for an impossible one."""
+    """The columns of a model, one after the other; ValueError for an impossible one."""
     numbers, at = model.astype(np.int64), 0
 
     def take(count: int) -> Array:
         nonlocal at
         at += count
-        if count < 0 or at > len(numbers):
-            raise BadStream("its model is cut short")
+        expect(count >= 0 and at <= len(numbers), "its model is cut short")
         return numbers[at - count : at]
 
     for _ in range(columns):
-        signed = bool(take(1)[0])
-        weights, shares = take(1 + PREDICTORS).tolist(), take(ACTIVITY).tolist()
-        count = int(take(1)[0])
-        possible = count < MOST_CONTEXTS and max(map(abs, weights)) <= LARGEST_WEIGHT
+        signed, *weights = take(2 + PREDICTORS).tolist()
+        *shares, count = take(ACTIVITY + 1).tolist()
         thresholds = take(count)
-        possible &= (np.diff(thresholds) > 0).all() and 0 <= min(shares) and max(shares) <= LARGEST_SHARE
-        table = np.zeros((min(count, MOST_CONTEXTS) + 1, TOKENS), dtype=np.int64)
+        possible = count < MOST_CONTEXTS and (np.diff(thresholds) > 0).all()
+        possible &= max(map(abs, weights)) <= LARGEST_WEIGHT and 0 <= min(shares) and max(shares) <= LARGEST_SHARE
+        expect(possible, "its model is impossible")
+        table = np.zeros((count + 1, TOKENS), dtype=np.int64)
         for frequencies in table:
             first, used = take(2).tolist()
-            possible &= 0 <= first and 0 < used and first + used <= TOKENS
-            if possible:
-                frequencies[first : first + used] = take(used)
-        if not possible or (table < 0).any() or (table.sum(axis=1) != 1 << PRECISION).any():
-            raise BadStream("its model is impossible")
+            expect(0 <= first and 0 < used and first + used <= TOKENS, "its model has impossible tokens")
+            frequencies[first : first + used] = take(used)
+        possible = (table >= 0).all() and (table.sum(axis=1) == 1 << PRECISION).all()
+        expect(possible, "its model has impossible frequencies")
         starts = np.cumsum(table, axis=1) - table
         tokens = np.repeat(np.tile(np.arange(TOKENS), count + 1), table.ravel())
         slots = np.arange(len(tokens)) & ((1 << PRECISION) - 1)
         contexts = np.searchsorted(thresholds, np.arange(MOST_ACTIVITY + 1), side="right") << PRECISION
         offsets = slots - np.repeat(starts.ravel(), table.ravel())
         frequencies = np.repeat(table.ravel(), table.ravel())
-        yield _Column(signed, weights, shares, contexts, tokens, frequencies, offsets)
-    if at != len(numbers):
-        raise BadStream("its model does not end where its table does")
+        yield _Column(bool(signed), weights, shares, contexts, tokens, frequencies, offsets)
+    expect(at == len(numbers), "its model does not end where its table does")

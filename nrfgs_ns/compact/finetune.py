@@ -28,7 +28,7 @@ from torch import Tensor, nn
 from torch.nn.functional import logsigmoid
 
 from nrfgs_ns.appearance.head import Field, SplatAppearance, ViewNoise, VisibleSplats
-from nrfgs_ns.appearance.reduce import build, latent_basis, with_components, with_rank
+from nrfgs_ns.appearance.reduce import latent_basis, with_components, with_rank
 from nrfgs_ns.compact.encode import drawable
 from nrfgs_ns.compact.tables import COLUMNS, MOST_BITS, Grid, morton, splats_of, steps_of, tables_of
 from nrfgs_ns.data.views import camera_spacing
@@ -93,7 +93,6 @@ class Density(nn.Module):
     def __init__(self, values: Tensor):
         super().__init__()
         columns = values.shape[1]
-        values = values if len(values) else values.new_zeros(1, columns)
         spread, mean = values.std(dim=0, correction=0), values.mean(dim=0)
         widths = spread.clamp_min(1e-6).log()[:, None] + values.new_tensor(WIDTHS)
         self.centers = nn.Parameter(mean[:, None].repeat(1, len(WIDTHS)))
@@ -170,13 +169,10 @@ class CodedSplats(nn.Module):
     def keep(self, kept: Tensor, optimizer: torch.optim.Optimizer) -> None:
         """Remove the splats that are not `kept`, bool [N], and their optimizer state."""
         for group, table in zip(optimizer.param_groups, self.tables.values(), strict=False):
-            old = table.values
-            table.values = nn.Parameter(old[kept])
+            state = optimizer.state.pop(table.values, {})
+            table.values = nn.Parameter(table.values[kept])
             group["params"] = [table.values]
-            optimizer.state[table.values] = {
-                key: value[kept] if value.shape == old.shape else value
-                for key, value in optimizer.state.pop(old, {}).items()
-            }
+            optimizer.state[table.values] = {key: value[kept] if value.ndim else value for key, value in state.items()}
 
     @staticmethod
     def _row(tables: Mapping[str, Tensor]) -> Tensor:
@@ -256,21 +252,18 @@ def fine_tune(
     """
     model, data = pipeline.model, pipeline.datamanager
     cameras = data.train_dataset.cameras
-    view_count = len(cameras)
     noise = ViewNoise(model.noise_factor * camera_spacing(cameras.camera_to_worlds[:, :3, 3]), torch.initial_seed())
     field = model.field.detached()
     # Latents begin as their own principal components.
     field = with_rank(field, latent_basis(field, contributions_to(model, cameras)), field.head.config.latent_dim)
-    head = build(field.head.config, field.head.state_dict(), field.head.scene_unit).requires_grad_(True).train()
-    splats = drawable(field.splats)
-    coded = CodedSplats(splats)
-    count = len(splats["means"])
+    head = field.head.requires_grad_(True).train()
+    coded = CodedSplats(drawable(field.splats))
+    count = len(coded.tables["means"].values)
     of_bits = torch.tensor(rate / (8 * count), device=model.device)  # loss of a bit
     smallest, largest = (limit / (8 * count) for limit in RATES_FOR_SIZE)
     haste = min(HASTE * EVERY / steps, HASTIEST)
     rates = RATES | {"means": RATES["means"] * model.scene_unit}
-    if len(latents := coded.tables["latents"].values) > 1:
-        rates["latents"] *= float(latents.detach().std(dim=0, correction=0).max())
+    rates["latents"] *= float(coded.tables["latents"].values.detach().std(dim=0, correction=0).max())
     groups = [
         *({"params": [table.values], "lr": rates[name]} for name, table in coded.tables.items()),
         {"params": [table.log_steps for table in coded.tables.values()], "lr": STEPS_RATE},
@@ -289,7 +282,7 @@ def fine_tune(
             with torch.no_grad():
                 tables = coded(rounded=True)
                 cost = coded.bits(tables) * (WORTH * of_bits)
-            views = map(data.next_train, range(view_count))
+            views = map(data.next_train, range(len(cameras)))
             growth, loss = growth_without(model, Field(head, splats_of(tables)), views)
             # The training's loss is about the root of the squared error.
             kept = (turns != prunings.index(step)) | (0.5 * loss * growth > cost)

@@ -34,12 +34,12 @@ import lzma
 import math
 import struct
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from nrfgs_ns.compact.entropy import MOST_MODEL, decode_table, encode_table
+from nrfgs_ns.compact.entropy import MOST_MODEL, decode_table, encode_table, expect
 
 MAGIC = b"\x89NRF\r\n\x1a\n"
 VERSION = 3
@@ -62,8 +62,6 @@ LARGEST_MEMORY = 2**28
 """Bytes that xz may take to unpack: more than the dictionary needs."""
 ONE_BLOCK = b"\x02\x00\x21\x01"
 """How the header of a block begins: its length, no sizes, LZMA2, one byte of properties."""
-ENTRY = ("name", "coding", "dtype", "shape", "bytes", "crc32")
-"""Keys of an entry of "streams"."""
 BROKEN = OSError, LookupError, TypeError, ValueError, AttributeError, OverflowError, RuntimeError
 BROKEN += lzma.LZMAError, struct.error
 """Errors of reading a damaged or hostile file."""
@@ -78,15 +76,12 @@ class Table(NamedTuple):
     """from -2^31 to 2^31 - 1, and like their neighbours; False: from 0 to 2^32 - 1"""
 
 
-def container(
-    header: Mapping[str, Any], streams: Mapping[str, np.ndarray | Table], advance: Callable[[], None] = lambda: None
-) -> bytes:
+def container(header: Mapping[str, Any], streams: Mapping[str, np.ndarray | Table]) -> bytes:
     """The bytes of a file.
 
     Args:
         header: what JSON can hold; "streams" is added.
         streams: arrays of DTYPES, and tables.
-        advance: called after each stream.
     """
     entries, bodies = [], []
     for name, stream in streams.items():
@@ -95,7 +90,6 @@ def container(
         sizes = {"dtype": array.dtype.name, "shape": list(array.shape), "bytes": len(body)}
         entries.append({"name": name, "coding": coding, **sizes, "crc32": zlib.crc32(body)})
         bodies.append(body)
-        advance()
     text = json.dumps({**header, "streams": entries}, allow_nan=False).encode("utf-8")
     total = PREAMBLE.size + len(text) + CHECKSUM.size + sum(map(len, bodies))
     start = PREAMBLE.pack(MAGIC, VERSION, len(text), total) + text
@@ -104,14 +98,13 @@ def container(
 
 def read_header(data: bytes) -> tuple[dict[str, Any], int]:
     """The header of a file's bytes, and where its streams begin; one of BROKEN if it is damaged or of another kind."""
-    if not data.startswith(MAGIC):
-        raise ValueError(f"it begins with {data[: len(MAGIC)]!r}")
+    expect(data.startswith(MAGIC), f"it begins with {data[: len(MAGIC)]!r}")
     _, version, length, total = PREAMBLE.unpack_from(data)
-    if version != VERSION:  # another version may be laid out differently
-        raise ValueError(f"it is of version {version} of the format, and this program reads version {VERSION}")
+    # Another version may be laid out differently.
+    expect(version == VERSION, f"it is of version {version} of the format, and this program reads version {VERSION}")
     header_end = PREAMBLE.size + length
-    if len(data) != total or zlib.crc32(data[:header_end]) != CHECKSUM.unpack_from(data, header_end)[0]:
-        raise ValueError(f"it is damaged or cut short: {len(data)} bytes, of {total}")
+    whole = len(data) == total and zlib.crc32(data[:header_end]) == CHECKSUM.unpack_from(data, header_end)[0]
+    expect(whole, f"it is damaged or cut short: {len(data)} bytes, of {total}")
     return read_json(data[PREAMBLE.size : header_end]), header_end + CHECKSUM.size
 
 
@@ -120,23 +113,21 @@ def read_streams(data: bytes, entries: list[dict[str, Any]], first: int) -> dict
     unpacked = 0
     streams = {}
     for entry in entries:
-        check_keys(entry, ENTRY, named := f"the stream {ascii(entry)}")
+        named = f"the stream {ascii(entry)}"
+        check_keys(entry, ("name", "coding", "dtype", "shape", "bytes", "crc32"), named)
         sizes = entry["shape"]
         kinds = type(entry["name"]), type(sizes), type(entry["bytes"])
-        if kinds != (str, list, int) or entry["dtype"] not in CODINGS[entry["coding"]] or entry["name"] in streams:
-            raise ValueError(named)
-        if not all(type(size) is int and size >= 0 for size in sizes):
-            raise ValueError(named)
+        expect(kinds == (str, list, int) and entry["dtype"] in CODINGS[entry["coding"]], named)
+        expect(entry["name"] not in streams and all(type(size) is int and size >= 0 for size in sizes), named)
         unpacked += math.prod(max(size, 1) for size in sizes) * np.dtype(entry["dtype"]).itemsize
-        if unpacked > max(LARGEST_RATIO * len(data), SMALL):
-            raise ValueError(f"{named} would unpack to more than {LARGEST_RATIO} times the file")
+        room = max(LARGEST_RATIO * len(data), SMALL)
+        expect(unpacked <= room, f"{named} would unpack to more than {LARGEST_RATIO} times the file")
         body = data[first : first + entry["bytes"]]
         first += entry["bytes"]
-        if len(body) != entry["bytes"] or zlib.crc32(body) != entry["crc32"]:
-            raise ValueError(f"the checksum of its stream {entry['name']!r} does not hold")
+        whole = len(body) == entry["bytes"] and zlib.crc32(body) == entry["crc32"]
+        expect(whole, f"the checksum of its stream {entry['name']!r} does not hold")
         streams[entry["name"]] = (_uncoded if entry["coding"] == "rans" else _unpack)(entry, body)
-    if first != len(data):
-        raise ValueError(f"it has {len(data) - first} bytes after its last stream")
+    expect(first == len(data), f"it has {len(data) - first} bytes after its last stream")
     return streams
 
 
@@ -144,8 +135,7 @@ def read_json(text: bytes) -> dict[str, Any]:
     """An object in UTF-8 as every JSON reader has it: numbers are finite float64, and those without a fraction int."""
 
     def number(digits: str) -> int | float:
-        if not math.isfinite(value := float(digits)):
-            raise ValueError(f"{digits[:20]} is no number")
+        expect(math.isfinite(value := float(digits)), f"{digits[:20]} is no number")
         return int(value) if value.is_integer() else value
 
     return json.loads(text.decode("utf-8"), parse_int=number, parse_float=number, parse_constant=number)
@@ -153,8 +143,8 @@ def read_json(text: bytes) -> dict[str, Any]:
 
 def check_keys(value: Any, keys: Sequence[str], what: str, optional: Sequence[str] = ()) -> None:
     """Raise ValueError unless a value is an object with these keys."""
-    if not isinstance(value, dict) or not set(keys) <= value.keys() <= {*keys, *optional}:
-        raise ValueError(f"{what} has not the keys {', '.join(keys)}, or has others")
+    right = isinstance(value, dict) and set(keys) <= value.keys() <= {*keys, *optional}
+    expect(right, f"{what} has not the keys {', '.join(keys)}, or has others")
 
 
 def _pack(array: np.ndarray) -> bytes:
@@ -172,12 +162,11 @@ def _unpack(entry: Mapping[str, Any], body: bytes) -> np.ndarray:
     unpacker = lzma.LZMADecompressor(format=lzma.FORMAT_XZ, memlimit=LARGEST_MEMORY)
     raw = unpacker.decompress(body, max_length=count * size + 1) if body else b""
     complete = not body or unpacker.eof and not unpacker.unused_data and unpacker.check == lzma.CHECK_NONE
-    if len(raw) != count * size or not complete:
-        raise ValueError(f"it does not hold {count} numbers of {size} bytes")
+    expect(complete and len(raw) == count * size, f"it does not hold {count} numbers of {size} bytes")
     # Its index, whose length is at the end, begins with 0 and the number of blocks, up to 127.
     blocks = body[-12 - 4 * (int.from_bytes(body[-8:-4], "little") + 1) + 1] if body else 0
-    if blocks > 1 or blocks == 1 and not body.startswith(ONE_BLOCK, 12):
-        raise ValueError(f"it is packed in {blocks} blocks or with other filters")
+    plain = blocks == 0 or blocks == 1 and body.startswith(ONE_BLOCK, 12)
+    expect(plain, f"it is packed in {blocks} blocks or with other filters")
     planes = np.frombuffer(raw, dtype=np.uint8).reshape(size, count)
     return np.ascontiguousarray(planes.T).view(np.dtype(entry["dtype"]).newbyteorder("<")).reshape(entry["shape"])
 
@@ -194,11 +183,11 @@ def _coded(table: Table) -> tuple[np.ndarray, bytes]:
 def _uncoded(entry: Mapping[str, Any], body: bytes) -> np.ndarray:
     columns, rows = entry["shape"]
     count, size = MODEL.unpack_from(body)
-    if columns > MOST_COLUMNS or count > columns * MOST_MODEL:
-        raise ValueError(f"a model of {count} numbers for {columns} columns is too large")
+    small = columns <= MOST_COLUMNS and count <= columns * MOST_MODEL
+    expect(small, f"a model of {count} numbers for {columns} columns is too large")
     model = _unpack({"shape": [count], "dtype": "int32"}, body[MODEL.size : MODEL.size + size])
     table = decode_table(model, body[MODEL.size + size :], columns, rows)
     bounds = np.iinfo(entry["dtype"])
-    if table.size and not bounds.min <= table.min() <= table.max() <= bounds.max:
-        raise ValueError(f"it holds numbers that are no {entry['dtype']}")
+    fits = not table.size or bounds.min <= table.min() <= table.max() <= bounds.max
+    expect(fits, f"it holds numbers that are no {entry['dtype']}")
     return table.astype(entry["dtype"])

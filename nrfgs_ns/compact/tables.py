@@ -128,7 +128,6 @@ def splats_of(tables: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def steps_of(tables: Mapping[str, Tensor]) -> dict[str, Array]:
     """Steps of each table's columns without a fine-tune."""
     median = float(np.exp(np.median(tables["scales"].mean(dim=1).cpu().numpy())))
-    latents = tables["latents"]
-    spread = float(latents.std(dim=0, correction=0).max()) if len(latents) > 1 else 0.0
+    spread = float(tables["latents"].std(dim=0, correction=0).max())
     units = {"means": median, "latents": spread if spread > 0 else 1.0 / STEPS["latents"]}
     return {name: np.full(tables[name].shape[1], step * units.get(name, 1.0)) for name, step in STEPS.items()}

@@ -1,20 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`nrfgs export FORMAT`."""
+"""`nrfgs export FORMAT`: its options, which are read before torch is imported."""
 
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Literal
 
 import tyro
 
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.export.options import SCENE, CompactOptions, PlyOptions, WebOptions
 from nrfgs_ns.files import check_writable
 from nrfgs_ns.trained.find import NamesTraining
 
-FLAT = tyro.conf.arg(name="")
-"""A group of options without a prefix."""
+SCENE = "scene.nrf"
+"""Name of the scene's file in a page's folder."""
 
 
 @dataclass
@@ -44,57 +43,82 @@ class _Format(NamesTraining):
 class Ply(_Format):
     """The format of 3D Gaussian Splatting, with spherical harmonics fitted to the colours."""
 
-    options: Annotated[PlyOptions, FLAT] = field(default_factory=PlyOptions)
+    world: Literal["viewers", "training", "capture"] = "viewers"
+    """viewers: y points down, as viewers of 3DGS files expect. training: z points up, as in training and in ns-export's
+    files. capture: the data set's own axes and unit of length; from coordinates too large for float32 an origin is
+    subtracted, which the file's header tells"""
+    steps: int | None = None
+    """steps of the fine-tune towards the model's images. None: 2,500; on a CPU 10 for each training view, at most
+    400"""
 
     def main(self) -> None:
         config = self.checked(self.output)
-        if self.options.steps is not None and self.options.steps < 0:
-            raise InputError(f"--steps is {self.options.steps}; it must be at least 0.")
+        if self.steps is not None and self.steps < 0:
+            raise InputError(f"--steps is {self.steps}; it must be at least 0.")
         from nrfgs_ns.export.ply import export_ply
 
-        export_ply(config, self.output, self.options, self.measure, self.report)
+        export_ply(config, self)
 
 
 @dataclass
 class Compact(_Format):
     """The field itself in a small file, for nrfgs view, ns-eval, ns-viewer and ns-render (docs/compact-format.md)."""
 
-    options: Annotated[CompactOptions, FLAT] = field(default_factory=CompactOptions)
+    finetune: int = 0
+    """steps of a fine-tune for the file: tables that cost less, learnt rounding. 0: the model's numbers, rounded"""
+    rate: float = 1e-4
+    """with finetune: the training's loss that one byte for each splat is worth. More: a smaller file"""
+    size_mb: float | None = None
+    """millions of bytes that the output may have: it becomes as precise as that allows. With finetune the rate is
+    found while it trains, and rate is where it begins"""
+
+    def checked(self, *files: Path) -> Path:
+        for name in ("finetune", "rate"):
+            if not (value := getattr(self, name)) >= 0:
+                raise InputError(f"--{name} is {value}; it must be zero or positive.")
+        if self.size_mb is not None and not 0 < self.size_mb < math.inf:
+            raise InputError(f"--size-mb is {self.size_mb}; it must be positive, in millions of bytes.")
+        return super().checked(*files)
 
     def main(self) -> None:
         config = self.checked(self.output)
-        check_compact(self.options)
         from nrfgs_ns.export.compact import export_compact
 
-        export_compact(config, self.output, self.options, self.measure, self.report)
+        export_compact(config, self)
 
 
 @dataclass
-class Web(_Format):
+class Web(Compact):
     """A page that runs the field in a browser (docs/web.md): a file, or, unless --output ends in .html, a folder."""
 
-    options: Annotated[CompactOptions, FLAT] = field(default_factory=CompactOptions)
-    page: Annotated[WebOptions, FLAT] = field(default_factory=WebOptions)
+    title: str | None = None
+    """heading of the page. None: the output's name"""
+    author: str = ""
+    """a line below the heading"""
+    tour: tuple[str, ...] = ()
+    """a tour: two or more photographs by number or name, or one JSON file, saved in a page or by nerfstudio's viewer"""
+    rotate: bool = False
+    """without a tour: turn slowly around the subject"""
+    notes: Path | None = None
+    """JSON file of notes at points of the scene, as a page saves it"""
+    address: str | None = None
+    """where the page will be, https://...: writes a picture beside it, which is shown where the address is shared"""
+
+    @property
+    def alone(self) -> bool:
+        """Whether the page is one file with the scene in it."""
+        return self.output.suffix.lower() in (".html", ".htm")
 
     def main(self) -> None:
-        alone = self.output.suffix.lower() in (".html", ".htm")
-        if self.output.exists() and self.output.is_file() != alone:
+        if self.output.exists() and self.output.is_file() != self.alone:
             kind = "file" if self.output.is_file() else "folder"
             fix = "Name a file that ends in .html, or a folder that does not."
             raise InputError(f"--output {self.output} is a {kind}. {fix}")
-        config = self.checked(*([self.output] if alone else [self.output / name for name in ("index.html", SCENE)]))
-        check_compact(self.options)
+        files = [self.output] if self.alone else [self.output / "index.html", self.output / SCENE]
+        config = self.checked(*files)
         from nrfgs_ns.export.web.command import export_web
 
-        export_web(config, self.output, self.options, self.page, self.measure, self.report)
-
-
-def check_compact(options: CompactOptions) -> None:
-    for name in ("finetune", "rate"):
-        if not (value := getattr(options, name)) >= 0:
-            raise InputError(f"--{name} is {value}; it must be zero or positive.")
-    if options.size_mb is not None and not 0 < options.size_mb < math.inf:
-        raise InputError(f"--size-mb is {options.size_mb}; it must be positive, in millions of bytes.")
+        export_web(config, self)
 
 
 @dataclass

@@ -5,7 +5,6 @@ import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from shlex import quote
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from nrfgs_ns.compact.encode import encode
 from nrfgs_ns.compact.finetune import REPORT_EVERY, fine_tune
 from nrfgs_ns.compact.format import container
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.export.options import CompactOptions
+from nrfgs_ns.export.command import Compact
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.progress import progress
 from nrfgs_ns.threads import few_threads
@@ -38,24 +37,22 @@ PLY_BYTES = 62 * 4
 """Bytes of a splat in 3DGS's PLY file, with harmonics of degree 3."""
 
 
-def export_compact(
-    load_config: Path, output: Path, options: CompactOptions, measure: bool, report: Path | None
-) -> None:
+def export_compact(load_config: Path, options: Compact) -> None:
     """Write a compact file, and report its size and loss; see `nrfgs export compact --help`."""
     with few_threads() as threads:
-        pipeline = load_field(load_config, measure)
+        pipeline = load_field(load_config, options.measure)
         threads.suit_to(pipeline)
-        config, numbers = write_file(pipeline, load_config, output, options, measure)
+        config, numbers = write_file(pipeline, load_config, output := options.output, options)
     count, size, ply_size = (numbers[name] for name in ("written", "bytes", "ply_bytes"))
     lines = [
         f"{output}: {count:,} splats with latents of {numbers['rank']} numbers, {size / 1e6:.2f} MB, "
         f"{size / count:.1f} bytes a splat: 3DGS's PLY of as many splats has {ply_size / 1e6:.2f} MB, "
         f"{ply_size / size:.1f} times as much."
     ]
-    lines += [lost(numbers)] if measure else []
+    lines += [lost(numbers)] if options.measure else []
     lines.append(f"Look at it with:  nrfgs view {quote(str(output))}")
     lines.append(f"Evaluate it with:  ns-eval --load-config {quote(str(config))}")
-    finish(lines, numbers, report)
+    finish(lines, numbers, options.report)
 
 
 def load_field(load_config: Path, measured: bool) -> NrfgsPipeline:
@@ -69,25 +66,22 @@ def load_field(load_config: Path, measured: bool) -> NrfgsPipeline:
 
 
 def write_file(
-    pipeline,
-    load_config: Path,
-    output: Path,
-    options: CompactOptions,
-    measure: bool,
-    total: Callable[[int], int] = lambda size: size,
+    pipeline, load_config: Path, output: Path, options: Compact, total: Callable[[int], int] = lambda size: size
 ) -> tuple[Path, dict[str, Any]]:
     """Write a compact file; returns the config.yml with which nerfstudio reads it, and numbers for a report.
 
     Args:
         total: bytes of the compact file -> bytes of all that is written, for `options.size_mb`.
     """
-    times = [perf_counter()]
     model = pipeline.model
     field = model.field.detached()
     steps = rate = None
-    render = {"rasterize_mode": model.config.rasterize_mode, "background": model.background_color.tolist()}
-    render["near_plane"] = model.projection_options.near_plane
-    limit = None if options.size_mb is None else 1e6 * options.size_mb
+    render = {
+        "rasterize_mode": model.config.rasterize_mode,
+        "background": model.background_color.tolist(),
+        "near_plane": model.projection_options.near_plane,
+    }
+    limit = math.inf if options.size_mb is None else 1e6 * options.size_mb
     if options.finetune > 0:
         with progress("Training for the file", -(-options.finetune // REPORT_EVERY)) as advance:
             field, steps, rate = fine_tune(
@@ -95,24 +89,20 @@ def write_file(
                 options.finetune,
                 options.rate,
                 lambda bits: advance(f"Training for the file ({bits / 8e6:.2f} MB)"),
-                None if limit is None else size_of_tables(field, render, limit, total),
+                None if limit == math.inf else size_of_tables(field, render, limit, total),
             )
     else:  # latents in principal components, of which the small ones are rounded to 0 and take few bytes
         basis = latent_basis(field, torch.ones(model.num_points, device=model.device))
         field = with_rank(field, basis, field.head.config.latent_dim)
-    times.append(perf_counter())
     data, coarser = encoded(field, render, steps, limit, total)
     write_whole(output, data)
-    times.append(perf_counter())
     decoded = decode(output)
-    times.append(perf_counter())
     config = write_config(load_config, output, decoded.config)
     count = len(decoded.splats["means"])
     numbers = {
         "splats": model.num_points,
         "written": count,
         "rank": decoded.config.latent_dim,
-        "seconds": dict(zip(("finetune", "encode", "decode"), np.diff(times).tolist(), strict=True)),
         "finetune": options.finetune,
         "rate": rate,
         "coarser": coarser,
@@ -121,7 +111,7 @@ def write_file(
         "ply_ratio": PLY_BYTES * count / size,
         "stream_bytes": {entry["name"]: entry["bytes"] for entry in decoded.header["streams"]},
     }
-    if measure:
+    if options.measure:
         file = load_model(config, "test").model  # as ns-eval reads it
         numbers |= measure_loss(pipeline, lambda camera: {"file": file.get_outputs_for_camera(camera)["rgb"]})
     return config, numbers
@@ -141,32 +131,25 @@ def encoded(
     field: Field,
     render: dict[str, Any],
     steps: Mapping[str, np.ndarray] | None,
-    limit: float | None,
+    limit: float,
     total: Callable[[int], int],
 ) -> tuple[bytes, float]:
     """A compact file, and the factor of its grids' steps: 1, unless all that is written would have more than `limit`
     bytes. Then it has at most these, and more than ENOUGH of them after few attempts; InputError if the coarsest file
     has more."""
     files: dict[float, bytes] = {}  # by the logarithm (base 2) of the factor
-
-    def attempt(log: float) -> int:
-        header, streams = encode(field, render, steps, 2.0**log)
-        count = "" if limit is None else f", attempt {len(files) + 1}"
-        with progress(f"Encoding{count}", len(streams)) as advance:
-            files[log] = container(header, streams, advance)
-        return total(len(files[log]))
-
-    log, size = 0.0, attempt(0.0)
-    if limit is None or size <= limit:
-        return files[log], 1.0
+    log, last = 0.0, None
     slope = (13 * len(field.splats["means"]) + field.splats["latents"].numel()) / 8  # a bit a number and doubling
-    while len(files) < MOST_ATTEMPTS and not ENOUGH * limit <= size <= limit:
+    while log not in files and len(files) < MOST_ATTEMPTS:
+        with progress("Encoding" if limit == math.inf else f"Encoding, attempt {len(files) + 1}"):
+            files[log] = container(*encode(field, render, steps, 2.0**log))
+        size = total(len(files[log]))
+        if size <= limit and (log == 0.0 or size >= ENOUGH * limit):
+            break
+        if last is not None:
+            slope = max((last[1] - size) / (log - last[0]), 1.0)
         last = log, size
         log = min(max(log + (size - AIM * limit) / slope, 0.0), math.log2(COARSEST))
-        if log in files:
-            break
-        size = attempt(log)
-        slope = max((last[1] - size) / (log - last[0]), 1.0)
     fitting = [log for log, data in files.items() if total(len(data)) <= limit]
     if not fitting:
         raise too_small(limit, min(total(len(data)) for data in files.values()))

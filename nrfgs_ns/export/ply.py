@@ -22,8 +22,8 @@ from nrfgs_ns.appearance.head import Field
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.data.views import in_view
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.export.command import Ply
 from nrfgs_ns.export.frames import NOWHERE, Y_DOWN, Similarity, to_capture
-from nrfgs_ns.export.options import PlyOptions
 from nrfgs_ns.files import whole
 from nrfgs_ns.model.harmonics_fit import PlainSplats
 from nrfgs_ns.model.pinholes import pinhole
@@ -48,10 +48,11 @@ WORTH_A_WORD = 0.1
 """Loss in dB from which the command mentions it."""
 
 
-def export_ply(load_config: Path, output: Path, options: PlyOptions, measure: bool, report_file: Path | None) -> None:
+def export_ply(load_config: Path, options: Ply) -> None:
     """Write a PLY file, and report what it costs; see `nrfgs export ply --help`."""
+    output = options.output
     with few_threads() as threads:
-        pipeline = load_model(load_config, "test" if measure else "inference", measure)
+        pipeline = load_model(load_config, "test" if options.measure else "inference", options.measure)
         threads.suit_to(pipeline)
         pipeline.model.fit_on(pipeline.cameras_to_fit, options.steps)
         begin = perf_counter()
@@ -77,9 +78,9 @@ def export_ply(load_config: Path, output: Path, options: PlyOptions, measure: bo
         }
         if origin.any():
             report["origin"] = origin.tolist()
-        if measure:
+        if options.measure:
             report |= measure_loss(pipeline, pictures_of_file(pipeline.model, output, placed))
-    finish(summary(output, report), report, report_file)
+    finish(summary(output, report), report, options.report)
 
 
 def summary(output: Path, report: dict[str, Any]) -> Iterator[str]:

@@ -5,10 +5,8 @@ A model with a panel (`viewer_panel`) follows it only in the viewer's render thr
 cannot reach a training, an evaluation or ns-render.
 """
 
-import contextlib
 import sys
 import threading
-from collections.abc import Iterator
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -27,20 +25,6 @@ STEP_FORWARD = 5.0
 """Distance of a browser's first view in front of the first photograph, in sizes of the frustums that mark photographs.
 Frustums of 30 degrees and more then lie behind it."""
 MEAN_LOOK = "all photographs' mean"
-MARKER_COLOR = (255, 211, 105)
-"""The viewer's yellow, for the frustum that marks a frozen view"""
-
-
-@contextlib.contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Suspend nerfstudio's trace function, which interrupts a rendering by an exception at any line: inside viser that
-    would leave a lock taken."""
-    trace = sys.gettrace()
-    sys.settrace(None)
-    try:
-        yield
-    finally:
-        sys.settrace(trace)
 
 
 class ViewerPanel(ViewerControl):
@@ -65,35 +49,30 @@ class ViewerPanel(ViewerControl):
             self.legend = gui.add_markdown(self.legends[FULL])
             hint = "How much of the view dependence is added: 0 nothing, 1 as trained"
             self.gain = gui.add_slider("Residual gain", 0.0, 2.0, 0.05, 1.0, hint=hint)
-            self.stops = gui.add_slider("Exposure", -3.0, 3.0, 0.1, 0.0, hint="Stops by which the image is brighter")
-            self.look = None
-            if self.model.photograph is not None:
-                names = [MEAN_LOOK, *self.model.photograph.names]
-                self.look = gui.add_dropdown("Look", names, MEAN_LOOK, hint="The photograph whose exposure is shown")
+            self.photographs = [] if self.model.photograph is None else self.model.photograph.names
+            hint, looks = "The photograph whose exposure is shown", [MEAN_LOOK, *self.photographs]
+            self.look = gui.add_dropdown("Look", looks, MEAN_LOOK, visible=len(looks) > 1, hint=hint)
             hint = "Keep the appearance that the splats have from here, and walk around them"
             self.freeze = gui.add_checkbox("Freeze view", initial_value=False, hint=hint)
             self.count = gui.add_text("Splats", initial_value=f"{self.model.num_points:,}", disabled=True)
         # One callback each: viser runs a control's callbacks in no particular order.
         self.mode.on_update(lambda _: self._change_mode())
-        for control in filter(None, (self.gain, self.stops, self.look)):
+        for control in (self.gain, self.look):
             control.on_update(lambda _: viewer._trigger_rerender())
         self.freeze.on_update(lambda event: self._freeze(event.client))
-        self.marker = None
-        self.waiting: list = []  # browsers that connected before the scene was there
-        viewer.viser_server.on_client_connect(self._welcome)
+        viewer.viser_server.on_client_connect(self.welcome)
 
     @staticmethod
     def is_asking() -> bool:
         """Whether this code runs in a render thread of nerfstudio's viewer."""
         return isinstance(threading.current_thread(), RenderStateMachine)
 
-    def _welcome(self, client) -> None:
-        """Move a browser to before the first training photograph: nerfstudio's own first view may see nothing."""
-        photographs = list(getattr(self.viewer, "camera_handles", {}).values())
-        if not photographs:  # until the first picture
-            self.waiting.append(client)
+    def welcome(self, client) -> None:
+        """Move a browser to before the first training photograph, if the scene is open: nerfstudio's own first view may
+        see nothing."""
+        first = next(iter(getattr(self.viewer, "camera_handles", {}).values()), None)
+        if first is None:
             return
-        first = photographs[0]
         forward = SO3(first.wxyz).as_matrix()[:, 2]
         with client.atomic():
             client.camera.position = first.position + STEP_FORWARD * self.viewer.config.camera_frustum_scale * forward
@@ -103,47 +82,41 @@ class ViewerPanel(ViewerControl):
     def options(self) -> PictureOptions:
         """The picture that the controls name."""
         center = self.frozen_center if self.freeze.value else None
-        of_mean = self.look is None or self.look.value == MEAN_LOOK
-        photograph = None if of_mean else self.model.photograph.names.index(self.look.value)
-        return PictureOptions(self.mode.value, float(self.gain.value), center, float(self.stops.value), photograph)
+        photograph = None if self.look.value == MEAN_LOOK else self.photographs.index(self.look.value)
+        return PictureOptions(self.mode.value, float(self.gain.value), center, photograph)
 
     def render(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
         """Render one camera, a batch of one, as the controls say (`picture`)."""
-        with uninterrupted():
-            if self.count.value != (count := f"{self.model.num_points:,}"):
-                self.count.value = count
-            waiting, self.waiting = self.waiting, []
-            for client in waiting:
-                self._welcome(client)
         # As in nerfstudio, the viewer's background is used where the configuration leaves it open.
         background = self.background if self.model.config.background_color == "random" else None
         self.model.set_crop(obb_box)
+        trace = sys.gettrace()  # nerfstudio's, which interrupts a rendering by an exception at any line
+        if not self.is_slow:
+            sys.settrace(None)
         try:
-            with contextlib.nullcontext() if self.is_slow else uninterrupted():
-                return picture(self.model, camera, self.options, background)
+            return picture(self.model, camera, self.options, background)
         finally:
             self.model.set_crop(None)
+            if not self.is_slow:
+                sys.settrace(trace)
 
     @property
     def is_slow(self) -> bool:
         """Whether pictures may be interrupted. On a GPU an interrupted trial of a kernel would count as failed."""
         return self.model.device.type == "cpu"
 
+    def update_count(self) -> None:
+        """Show the number of splats. Not while rendering: an interruption inside viser would leave a lock taken."""
+        if self.count.value != (count := f"{self.model.num_points:,}"):
+            self.count.value = count
+
     def _change_mode(self) -> None:
         self.legend.content = self.legends[self.mode.value]
         self.viewer._trigger_rerender()
 
     def _freeze(self, client) -> None:
-        """Store and mark the position of the client's camera; None: a program sets `frozen_center` itself."""
-        if self.marker is not None:
-            self.marker.remove()
-            self.marker = None
+        """Store the position of the client's camera; None: a program sets `frozen_center` itself."""
         if self.freeze.value and client is not None:
-            camera = client.camera
-            size = self.viewer.config.camera_frustum_scale
-            self.frozen_center = torch.tensor(camera.position / VISER_NERFSTUDIO_SCALE_RATIO, dtype=torch.float32)
-            place = {"wxyz": camera.wxyz, "position": camera.position}
-            self.marker = self.viser_server.scene.add_camera_frustum(
-                "/frozen_view", camera.fov, camera.aspect, size, MARKER_COLOR, **place
-            )
+            position = client.camera.position / VISER_NERFSTUDIO_SCALE_RATIO
+            self.frozen_center = torch.tensor(position, dtype=torch.float32)
         self.viewer._trigger_rerender()

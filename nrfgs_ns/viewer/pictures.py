@@ -19,7 +19,6 @@ from nerfstudio.utils.colormaps import apply_float_colormap
 from torch import Tensor
 
 from nrfgs_ns.appearance.head import Field, SplatAppearance
-from nrfgs_ns.image.photograph import exposed
 from nrfgs_ns.rasterizer import View, composite
 
 FULL, BASE, VIEW_DEPENDENCE, DEPTH = "full", "base colour", "view dependence", "depth"
@@ -58,8 +57,6 @@ class PictureOptions:
     """factor of the residuals, >= 0; 1 is as trained"""
     frozen_center: Tensor | None = None
     """point [3] from which splats are seen, in world units; None: the camera's"""
-    stops: float = 0.0
-    """additional exposure of the image"""
     photograph: int | None = None
     """the training photograph whose exposure the image has; None: the mean of all"""
 
@@ -69,11 +66,11 @@ def legends(field: Field) -> dict[str, str]:
     means = field.splats["means"]
     with torch.no_grad():
         components = field.head.components(field.splats, means.new_zeros(0, dtype=torch.int64), means.new_zeros(3))
-    offered = {name: LEGENDS[component.kind] for name, component in components.items()}
     if field.head.at_pixel:
         return {FULL: LEGENDS[FULL], BASE: LEGENDS["pixels"], DEPTH: LEGENDS[DEPTH]}
-    first, last = ({mode: LEGENDS[mode] for mode in modes} for modes in ((FULL, BASE), (VIEW_DEPENDENCE, DEPTH)))
-    return first | offered | last
+    offered = {name: component.kind for name, component in components.items()}
+    kinds = {FULL: FULL, BASE: BASE, **offered, VIEW_DEPENDENCE: VIEW_DEPENDENCE, DEPTH: DEPTH}
+    return {mode: LEGENDS[kind] for mode, kind in kinds.items()}
 
 
 @torch.no_grad()
@@ -95,8 +92,6 @@ def picture(model, camera: Cameras, options: PictureOptions, background: Tensor 
     appearance = with_gain(field, view, 0.0 if options.mode == BASE else options.gain)
     outputs, _ = model.composite(view, appearance, background, model.look_of(options.photograph))
     if options.mode in (FULL, BASE):
-        if options.stops != 0.0:
-            outputs["rgb"] = exposed(outputs["rgb"], options.stops)
         return outputs
 
     accumulation, behind = outputs["accumulation"], outputs["background"]
@@ -122,10 +117,7 @@ def with_gain(field: Field, view: View, gain: float) -> SplatAppearance:
     base appearance."""
     if gain == 1.0:
         return field.seen_from(view)
-    base = field.base_of(view)
-    if gain == 0.0:
-        return base
-    trained = field.seen_from(view)
+    base, trained = field.base_of(view), field.seen_from(view)
     colors = base.colors + gain * (trained.colors - base.colors)
     return SplatAppearance(
         colors=colors if field.head.at_pixel else colors.clamp_min(0.0),

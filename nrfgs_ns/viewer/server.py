@@ -11,7 +11,6 @@ import importlib.metadata
 import ipaddress
 import re
 import socket
-import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from http import HTTPStatus
@@ -36,14 +35,13 @@ WIDEST = 8.0
 """Largest ratio of a picture's sides"""
 LENS = (0.01, 3.1)
 """Smallest and largest field of view, radians"""
-SENT_BY_PAGES = (
-    _messages.ViewerCameraMessage,
-    _messages.GuiUpdateMessage,
+ALSO_SENT_BY_PAGES = (
     _messages.SceneNodeClickMessage,
     _messages.ScenePointerMessage,
     _messages.TransformControlsUpdateMessage,
 )
-"""Not among them: uploads, and the request for a public link, which only the user makes (`--viewer.make-share-url`)."""
+"""Besides cameras and values of controls. Not among them: uploads, and the request for a public link, which only the
+user makes (`--viewer.make-share-url`)."""
 
 
 @dataclass
@@ -55,20 +53,16 @@ class LocalViewerConfig(ViewerConfig):
     everybody who reaches this machine can look and steer"""
 
 
+@functools.cache
 def protect() -> None:
     """Guard all viewers of this process from now on; InputError if viser is of an unknown version."""
-    if infra.WebsockServer is GuardedServer:
-        return
-    version = importlib.metadata.version("viser")
-    if version != VISER:
+    if (version := importlib.metadata.version("viser")) != VISER:
         raise InputError(f"viser {version}: the viewer is guarded in {VISER} alone. Run: pip install viser=={VISER}.")
     infra.WebsockServer = GuardedServer
     # The page is built. To ask, viser looks through all processes of the machine, and fails if one of them ends then.
     _client_autobuild.ensure_client_is_built = lambda: None
-    _infra.websockets = SimpleNamespace(server=SimpleNamespace(serve=_serve), exceptions=websockets.exceptions)
     wrap("__init__", _open_guarded)
     wrap("update_scene", _update_without_exceptions)
-    wrap("training_complete", _complete_without_pause)
     ViewerLegacyState.__init__ = _refused
 
 
@@ -85,7 +79,7 @@ def _open_guarded(open_viewer: Callable[..., None], viewer: Viewer, config, *arg
     _check_address(config.websocket_host, config.websocket_port)
     open_viewer(viewer, config, *args, **options)
     if viewer.trainer is None:
-        _hide_pause(viewer)
+        viewer.pause_train.visible = False
     server = viewer.viser_server
     tunnel = server._share_tunnel
     if tunnel is not None and tunnel.get_url():
@@ -103,22 +97,12 @@ def _open_guarded(open_viewer: Callable[..., None], viewer: Viewer, config, *arg
 
 def _update_without_exceptions(update_scene: Callable[..., None], viewer: Viewer, step: int, *args, **options) -> None:
     """Update the scene, as a training does after each step: a browser that leaves, or whose camera is odd, must not end
-    it. Also show the step of a training that is over."""
+    it. Also show the number of splats, and the step of a training that is over."""
     with contextlib.suppress(Exception):
+        viewer.pipeline.model.viewer_panel.update_count()
         if viewer.trainer is None:
             viewer.update_step(step)
         update_scene(viewer, step, *args, **options)
-
-
-def _complete_without_pause(training_complete: Callable[..., None], viewer: Viewer) -> None:
-    """Complete the training, and hide the button, which would pause nothing."""
-    training_complete(viewer)
-    _hide_pause(viewer)
-
-
-def _hide_pause(viewer: Viewer) -> None:
-    for button in (viewer.pause_train, viewer.resume_train):
-        button.visible = False
 
 
 def _check_address(host: str, port: int | None) -> None:
@@ -176,10 +160,26 @@ class GuardedServer(infra.WebsockServer):
             messages.__exit__(None, None, None)
 
     def _background_worker(self, ready_sem) -> None:
-        _serving.server = self  # for `_serve`, which is called in this thread
+        # By this name viser serves, here alone, while whoever opens the viewer waits.
+        _infra.websockets = SimpleNamespace(server=SimpleNamespace(serve=self._serve), exceptions=websockets.exceptions)
         super()._background_worker(ready_sem)
 
-    def refusal(self, path: str, headers) -> tuple[HTTPStatus, dict, bytes] | None:
+    def _serve(self, handler, host: str, port: int, process_request, **options):
+        """`websockets.server.serve` of requests that are not refused."""
+
+        async def answer(path: str, headers):
+            return self._refusal(path, headers) or await process_request(path, headers)
+
+        async def handle(websocket) -> None:
+            async def recv() -> bytes:  # viser fails on messages of text
+                message = await websocket.recv()
+                return message if isinstance(message, bytes) else message.encode()
+
+            await handler(SimpleNamespace(send=websocket.send, recv=recv))
+
+        return websockets.server.serve(handle, host, port, process_request=answer, **options)
+
+    def _refusal(self, path: str, headers) -> tuple[HTTPStatus, dict, bytes] | None:
         """The answer to a request that is not served, None for the others."""
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not self._known(hosts[0]):
@@ -189,75 +189,46 @@ class GuardedServer(infra.WebsockServer):
         if headers.get_all("Upgrade") == ["websocket"]:
             return None
         root = self._http_server_root.resolve()
-        try:
+        with contextlib.suppress(OSError, ValueError):  # too long, or not a path
             path = path.partition("?")[0]
             file = (root / path.removeprefix("/")).resolve()
             if path == "/" or (file.is_relative_to(root) and file.is_file()):
                 return None
-        except (OSError, ValueError):  # too long, or not a path
-            pass
         return HTTPStatus.NOT_FOUND, {}, b"404"
 
     def _known(self, host: str) -> bool:
         """Whether a Host header names this server. Every address does: no name server can redirect one."""
         try:
             name = urlsplit(f"//{host}").hostname or ""
+            return name in self.names or bool(ipaddress.ip_address(name))
         except ValueError:
             return False
-        with contextlib.suppress(ValueError):
-            return bool(ipaddress.ip_address(name))
-        return name in self.names
 
     def _admit(self, raw: bytes):
-        """The message in some bytes; one without listeners for what no page sends. An exception would leave the
-        client's render thread running for ever."""
+        """The message in some bytes, with what decides the size of a picture clamped; one without listeners for what no
+        page sends. An exception would leave the client's render thread running for ever."""
         try:
             message = self._deserialize(raw)
-            self._check(message)
+            if isinstance(message, _messages.ViewerCameraMessage):
+                pose = np.array([*message.wxyz, *message.position], np.float32)
+                if len(pose) != 7 or not np.isfinite(pose).all() or not pose[:4].any():
+                    raise ValueError("no pose, on which a GPU's kernels may fail")
+                message.aspect = _clamped(message.aspect, 1 / WIDEST, WIDEST)
+                message.fov = _clamped(message.fov, *LENS)
+            elif isinstance(message, _messages.GuiUpdateMessage):
+                value = message.updates["value"]
+                if message.id in self.file_names:
+                    value = re.sub(r"[/\\]", "_", value)
+                elif message.id in self.bounds:
+                    value = _clamped(value, *self.bounds[message.id])
+                message.updates = {"value": value}
+            elif not isinstance(message, ALSO_SENT_BY_PAGES):
+                raise ValueError(type(message).__name__)
+            return message
         except Exception:  # whatever bytes may do to viser
             return _messages.ResetGuiMessage()
-        return message
-
-    def _check(self, message) -> None:
-        """Clamp what decides the size of a picture; ValueError if no page sends the message."""
-        if not isinstance(message, SENT_BY_PAGES):
-            raise ValueError(type(message).__name__)
-        if isinstance(message, _messages.ViewerCameraMessage):
-            pose = np.array([*message.wxyz, *message.position], np.float32)
-            if len(pose) != 7 or not np.isfinite(pose).all() or not pose[:4].any():
-                raise ValueError("no pose, on which a GPU's kernels may fail")
-            message.aspect = _clamped(message.aspect, 1 / WIDEST, WIDEST)
-            message.fov = _clamped(message.fov, *LENS)
-        elif isinstance(message, _messages.GuiUpdateMessage):
-            value = message.updates["value"]
-            if message.id in self.file_names:
-                value = re.sub(r"[/\\]", "_", value)
-            elif message.id in self.bounds:
-                value = _clamped(value, *self.bounds[message.id])
-            message.updates = {"value": value}
 
 
 def _clamped(value: float, low: float, high: float) -> float:
     """A number between its bounds; NaN becomes `low`."""
     return min(max(low, value), high)
-
-
-_serving = threading.local()
-
-
-def _serve(handler, host: str, port: int, process_request, **options):
-    """`websockets.server.serve` for viser, which asks the guard about requests."""
-    guard = _serving.server
-
-    async def answer(path: str, headers):
-        refusal = guard.refusal(path, headers)
-        return await process_request(path, headers) if refusal is None else refusal
-
-    async def handle(websocket) -> None:
-        async def recv() -> bytes:  # viser fails on messages of text
-            message = await websocket.recv()
-            return message if isinstance(message, bytes) else message.encode()
-
-        await handler(SimpleNamespace(send=websocket.send, recv=recv))
-
-    return websockets.server.serve(handle, host, port, process_request=answer, **options)

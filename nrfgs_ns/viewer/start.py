@@ -1,21 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """A faster start of nerfstudio's viewer, which decodes all photographs again, at full size, to show them 100 pixels
-high, and whose viser searches its archive of icons for every button, and imports Pillow's 40 formats to write JPEG."""
+high, and whose viser searches its archive of icons for every button."""
 
 import functools
 import tarfile
-import threading
 from collections.abc import Callable, Mapping, Sequence
-from types import SimpleNamespace
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import torch
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.viewer.viewer import Viewer
-from PIL import Image
 from torch import Tensor
-from viser import _gui_api, _gui_handles, _icons, _scene_api
+from viser import _gui_api, _gui_handles, _icons
 
 from nrfgs_ns.data.pictures import open_picture
 from nrfgs_ns.threads import few_threads
@@ -25,27 +22,21 @@ SIDE = 100
 """Pixels of the shorter side as shown"""
 
 
+@functools.cache
 def open_sooner() -> None:
-    if _gui_api.svg_from_icon is not icon:
-        _gui_api.svg_from_icon = _gui_handles.svg_from_icon = icon
-        _scene_api.iio = SimpleNamespace(imwrite=_write)
-        wrap("init_scene", _init_with_small_photographs)
+    _gui_api.svg_from_icon = _gui_handles.svg_from_icon = icon
+    wrap("init_scene", _init_with_small_photographs)
+
+
+def icon(name: str) -> str:
+    """`viser._icons.svg_from_icon`, with the archive read once."""
+    return _archived()[f"{name}.svg"].decode("utf-8")
 
 
 @functools.cache
-def icon(name: str) -> str:
-    """`viser._icons.svg_from_icon`, with the archive opened once."""
-    with _ARCHIVE_LOCK:
-        return _archive().extractfile(f"{name}.svg").read().decode("utf-8")
-
-
-_ARCHIVE_LOCK = threading.Lock()
-_archive = functools.cache(lambda: tarfile.open(_icons.ICONS_DIR / "tabler-icons.tar"))
-
-
-def _write(file: BinaryIO, image: np.ndarray, extension: str, **options: Any) -> None:
-    """`imageio.v3.imwrite`, without its imports."""
-    Image.fromarray(image).save(file, extension[1:], **options)
+def _archived() -> dict[str, bytes]:
+    with tarfile.open(_icons.ICONS_DIR / "tabler-icons.tar") as archive:
+        return {member.name: archive.extractfile(member).read() for member in archive}
 
 
 class SmallPhotographs:
@@ -77,7 +68,9 @@ class SmallPhotographs:
 
 
 def _init_with_small_photographs(init_scene: Callable[..., None], viewer: Viewer, train_dataset, *args, **options):
-    """Open the scene with small photographs."""
+    """Open the scene with small photographs, and show it to browsers that were there before it."""
     read = vars(viewer.pipeline.datamanager).get("cached_train")
     with few_threads():
         init_scene(viewer, SmallPhotographs(train_dataset, read), *args, **options)
+    for client in viewer.viser_server.get_clients().values():
+        viewer.pipeline.model.viewer_panel.welcome(client)

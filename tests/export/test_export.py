@@ -24,7 +24,6 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.export import ply
 from nrfgs_ns.export.command import Compact, Export, Ply, Web
 from nrfgs_ns.export.frames import Y_DOWN
-from nrfgs_ns.export.options import PlyOptions, WebOptions
 from nrfgs_ns.export.ply import read_splats, render_splats, write_splats
 from nrfgs_ns.image.metrics import psnr
 from nrfgs_ns.model import harmonics_fit, harmonics_tune
@@ -289,7 +288,7 @@ def test_harmonics_are_fitted_in_the_size_of_the_training(tiny_scene, tmp_path, 
 @pytest.mark.parametrize("method", METHODS)
 def test_ns_export_writes_the_same_splats(method, trained, tmp_path, export_gaussian_splat):
     config, ours = trained[method], tmp_path / "ours.ply"
-    Ply(config, output=ours, measure=False, options=PlyOptions(world="training")).main()
+    Ply(config, output=ours, measure=False, world="training").main()
     export_gaussian_splat(load_config=config, output_dir=tmp_path, output_filename="theirs.ply").main()
     a, b = (PlyData.read(tmp_path / f"{name}.ply")["vertex"].data for name in ("ours", "theirs"))
     assert a.dtype == b.dtype
@@ -302,7 +301,7 @@ def test_an_independent_reader_renders_the_models_picture(trained, tmp_path):
     from gsplat_call import rasterization
 
     config = trained["nrfgs-sh"]
-    Ply(config, output=tmp_path / "s.ply", measure=False, options=PlyOptions(world="training")).main()
+    Ply(config, output=tmp_path / "s.ply", measure=False, world="training").main()
     vertices = PlyData.read(tmp_path / "s.ply")["vertex"]
     table = torch.from_numpy(np.stack([vertices[name] for name in LAYOUT], axis=-1))
     means, _, dc, rest, opacities, scales, quats = table.split((3, 3, 3, 45, 1, 3, 4), dim=1)
@@ -355,7 +354,7 @@ def test_mistakes_are_told_in_a_sentence(trained, tmp_path):
 
 def test_a_page_holds_the_scene_and_the_photographs(trained, tmp_path):
     report = tmp_path / "report.json"
-    Web(trained["nrfgs"], output=tmp_path / "a/tea.html", report=report, page=WebOptions(author="me")).main()
+    Web(trained["nrfgs"], output=tmp_path / "a/tea.html", report=report, author="me").main()
     numbers, text = json.loads(report.read_text()), (tmp_path / "a/tea.html").read_text(encoding="utf-8")
     assert "<h1>tea</h1><p>me</p>" in text
     (tmp_path / "held.nrf").write_bytes(base64.b64decode(re.search('id="packed"[^>]*>([^<]*)<', text).group(1)))

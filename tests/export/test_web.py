@@ -8,9 +8,7 @@ from html.parser import HTMLParser
 
 import pytest
 
-from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.errors import InputError
-from nrfgs_ns.export.web.command import weight_vectors
 from nrfgs_ns.export.web.guide import read_notes, read_tour
 from nrfgs_ns.export.web.page import page
 
@@ -51,16 +49,6 @@ def test_a_page_needs_nothing_but_itself():
 def test_a_page_in_a_folder_names_its_scene():
     text = page(ABOUT, b"", "scene.nrf", "Tea")
     assert Elements(text).scripts["packed"] == "scene.nrf" and "connect-src 'self'" in text
-
-
-@pytest.mark.parametrize("options, vectors", [
-    ({}, 16 * (10 + 4) + 1 + 16 * (13 + 4) + 1),
-    ({"hidden_width": 30, "num_bands": 2, "use_distance": False}, 8 * (9 + 4) + 1 + 8 * (6 + 4) + 1),
-    ({"split_bands": False}, 32 * (22 + 4) + 1),
-    ({"num_bands": 1}, 16 * (10 + 4) + 1),
-])  # fmt: skip
-def test_how_many_weights_a_view_needs(options, vectors):
-    assert weight_vectors(NrfConfig(**options).setup()) == vectors
 
 
 def test_the_code_of_a_page_is_small():

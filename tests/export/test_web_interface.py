@@ -143,7 +143,7 @@ def test_embedded_where_the_code_says(opened, tmp_path):
         assert np.allclose(asked(3, "getCamera")["result"]["position"], VIEWS[1]["position"])
         assert len(asked(4, "photographs")["result"]) == 9
         assert "target" in asked(5, "setCamera", {"position": [1, 2, 3]})["error"]
-        for number, secret in enumerate(["picture", "measure", "constructor", "toString"], start=6):
+        for number, secret in enumerate(["picture", "constructor", "toString"], start=6):
             assert secret in asked(number, secret)["error"]
 
         # A page beside it, not around it, is not answered.

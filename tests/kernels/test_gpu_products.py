@@ -11,7 +11,6 @@ from short_trainings import command_line, trained, untrained
 
 from nrfgs_lab.training_run import evaluate
 from nrfgs_ns.export.command import Compact, Ply
-from nrfgs_ns.export.options import PlyOptions
 from nrfgs_ns.export.ply import read_splats
 from nrfgs_ns.viewer.pictures import AMPLIFICATION, BASE, DEPTH, FULL, VIEW_DEPENDENCE, PictureOptions, legends, picture
 
@@ -63,7 +62,7 @@ def test_exported_files(tiny_scene, tmp_path):
     config = trained(command_line("nrfgs", tiny_scene, out, STEPS, options))
     scores = evaluate(config, out / "eval.json")
     reports = {}
-    Ply(config, output=out / "splats.ply", report=out / "ply.json", options=PlyOptions(steps=8)).main()
+    Ply(config, output=out / "splats.ply", report=out / "ply.json", steps=8).main()
     Compact(config, output=out / "field.nrf", report=out / "compact.json").main()
     for kind in ("ply", "compact"):
         reports[kind] = json.loads((out / f"{kind}.json").read_text())

@@ -6,7 +6,6 @@ from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
 
-import imageio.v3
 import numpy as np
 import pytest
 import torch
@@ -16,13 +15,11 @@ from nerfstudio.utils import colormaps
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import CameraState
 from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
-from nerfstudio.viewer_legacy.server.viewer_utils import IOChangeException, SetTrace
 from PIL import Image
 from short_trainings import assert_same_training, checkpoint_of, command_line, set_up, untrained
 from small_capture import Capture
 from torch.testing import assert_close
-from viser import _icons, _scene_api
-from viser.infra import _infra
+from viser import _icons
 
 from nrfgs_ns.appearance.head import Field, SplatAppearance
 from nrfgs_ns.appearance.nrf import NrfConfig
@@ -233,6 +230,8 @@ def test_the_panel_rules_the_browser_and_nothing_else(build, open_viewer):
 
     viewer, panel, pose = open_viewer(pipeline), model.viewer_panel, camera.camera_to_worlds[0]
     plain = coarse(Browser.sees(viewer, pose)["rgb"])
+    panel.count.value = "?"
+    viewer.update_scene(0)
     assert panel.count.value == "300"
     panel.mode.value, panel.gain.value = "residual", 1.5
     panel.frozen_center, panel.freeze.value = model.project(elsewhere).center, True
@@ -269,14 +268,13 @@ def test_only_slow_pictures_are_interrupted(is_slow, build, open_viewer, monkeyp
     assert "panel.py" in interruptible and ("pictures.py" in interruptible) == is_slow
 
 
-def test_exposure_and_a_photographs_look(build, open_viewer):
+def test_a_photographs_look(build, open_viewer):
     pipeline = build("nrfgs", "--pipeline.model.photographs", "on")
     model, (camera, _) = pipeline.model, two_cameras(pipeline)
     with torch.no_grad():
         model.photograph.shots[3] = torch.tensor([-1.0, 0.5, 0.0])
     plain = picture(model, camera, PictureOptions())["rgb"]
     assert torch.equal(plain, model.get_outputs_for_camera(camera)["rgb"])  # the mean look
-    assert_close(picture(model, camera, PictureOptions(stops=1.0))["rgb"], exposed(plain, 1.0))
     third = picture(model, camera, PictureOptions(photograph=3))["rgb"]
     assert_close(third, exposed(plain, model.photograph.shots[3] @ torch.tensor(BASIS)))
     assert third.mean() < plain.mean() - 0.02
@@ -286,8 +284,6 @@ def test_exposure_and_a_photographs_look(build, open_viewer):
     panel.look.value = model.photograph.names[3]
     assert panel.options.photograph == 3
     assert coarse(Browser.sees(viewer, pose)["rgb"]).mean() < seen.mean() - 0.01
-    panel.stops.value = 1.5
-    assert panel.options.stops == 1.5
     assert torch.equal(model.get_outputs_for_camera(camera)["rgb"], plain)
 
 
@@ -337,31 +333,12 @@ def test_a_training_does_not_notice_who_watches(tiny_scene, tmp_path, open_viewe
     assert_same_training(quiet, watched, rtol=0, atol=0)
 
 
-def test_an_interrupted_rendering_leaves_no_lock_behind(build, open_viewer):
-    """Nerfstudio interrupts one by an exception at any line, and viser keeps its lock where that is one of its own."""
-    pipeline = build()
-    lock = open_viewer(pipeline).viser_server._websock_server._atomic_lock
-    panel, camera = pipeline.model.viewer_panel, pipeline.datamanager.eval_dataset.cameras[:1]
-    panel.count.value = "?"
-
-    def interrupt(frame, event, _):
-        if frame.f_code.co_filename == _infra.__file__ and lock.locked():
-            raise IOChangeException
-        return interrupt
-
-    with SetTrace(interrupt):
-        panel.render(camera)
-    assert panel.count.value == f"{pipeline.model.num_points:,}"
-    assert not lock.locked()
-
-
 # The viewer opens without reading anything twice, and shows what it showed.
 def test_a_training_s_photographs_are_not_read_again(pipeline, tiny_scene, tmp_path, monkeypatch):
     dataset, reads, shown = pipeline.datamanager.train_dataset, [], []
     get_data, threads = NrfgsInputDataset.get_data, torch.get_num_threads()
     monkeypatch.setattr(NrfgsInputDataset, "get_data", lambda *args, **more: reads.append(1) or get_data(*args, **more))
     log, lock = tmp_path / "log", threading.Lock()
-    monkeypatch.setattr(Image, "init", lambda: pytest.fail("imports all of Pillow's formats"))
     viewer = Viewer(ViewerConfig(), log, datapath=tiny_scene, pipeline=pipeline, train_lock=lock)
     scene = viewer.viser_server.scene
     add = scene.add_camera_frustum
@@ -378,12 +355,8 @@ def test_a_training_s_photographs_are_not_read_again(pipeline, tiny_scene, tmp_p
         viewer.viser_server.stop()
 
 
-def test_icons_and_pictures_are_visers(pipeline, monkeypatch):
+def test_icons_are_visers():
     assert all(start.icon(name) == _icons.svg_from_icon(name) for name in ("123", "camera", "zzz"))
-    picture = np.random.default_rng(0).integers(0, 256, (24, 30, 3), np.uint8)
-    ours = [_scene_api._encode_image_binary(picture, kind) for kind in ("jpeg", "png")]
-    monkeypatch.setattr(_scene_api, "iio", imageio.v3)
-    assert ours == [_scene_api._encode_image_binary(picture, kind) for kind in ("jpeg", "png")]
 
 
 def test_large_photographs_come_small(tmp_path, monkeypatch):

@@ -187,7 +187,6 @@ let fieldFor = null, row = 0, rowsLeft = 0;
 let share = Infinity;         // rows of the field in a frame, while it moves
 let scale = 1;                // resolution while it moves, of the whole
 let stale = true, scheduled = false, movedAt = -Infinity, lastFrame = null, pace = 16;
-let measuring = false, sortTook = 0;
 const waiting = [];           // who waits for the picture to be finished
 
 function wake() {
@@ -217,7 +216,6 @@ function frame(now) {
     const { eye, axes } = state.camera;
     reader.post({ camera: { view, lens, size: pixels, near: painter.near, eye, direction: axes[2] } });
   }
-  if (measuring) return;
 
   const asked = JSON.stringify([state.frozen ?? [state.camera, size], state.show, state.gain]);
   if (asked !== fieldFor) {
@@ -225,7 +223,12 @@ function frame(now) {
     rowsLeft = painter.rows;
   }
   if (rowsLeft > 0) {
-    const task = fieldTask();
+    const task = {
+      center: state.frozen ?? state.camera.eye,
+      camera: state.frozen ? null : seenBy(state.camera),
+      mode: state.show === "base" ? "full" : state.show,
+      gain: state.show === "base" ? 0 : state.gain,
+    };
     for (let left = Math.min(rowsLeft, moving ? Math.max(1, Math.round(share)) : painter.rows); left > 0; ) {
       const rows = Math.min(left, painter.rows - row);
       painter.evaluate(task, row, rows);
@@ -250,24 +253,13 @@ function frame(now) {
   if (moving || journey || turning || rowsLeft > 0 || held.size > 0 || stale || (drawnFor && drawnFor.resolution !== 1)) wake();
 }
 
-// What the field is evaluated for, as the page is set.
-function fieldTask() {
-  return {
-    center: state.frozen ?? state.camera.eye,
-    camera: state.frozen ? null : seenBy(state.camera),
-    mode: state.show === "base" ? "full" : state.show,
-    gain: state.show === "base" ? 0 : state.gain,
-  };
-}
-
 function paint(resolution) {
   painter.draw(seenBy(state.camera, resolution), state.show.endsWith("residual") ? "grey" : "full");
   drawMarks();
   placeNotes();
 }
 
-function sorted({ rows, seconds, along }) {
-  sortTook = seconds;
+function sorted({ rows, along }) {
   painter.setOrder(rows);
   const { eye, axes } = sortedFor.camera;
   surface = along === null ? null : { point: plus(eye, axes[2], along), axis: axes[2] };

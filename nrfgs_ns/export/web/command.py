@@ -13,13 +13,11 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from PIL import Image
 
-from nrfgs_ns.appearance.nrf import NeuralResidualField
-from nrfgs_ns.appearance.reduce import branches
 from nrfgs_ns.data.pictures import picture_names
 from nrfgs_ns.data.views import evenly_spaced, in_view
 from nrfgs_ns.errors import InputError
+from nrfgs_ns.export.command import SCENE, Web
 from nrfgs_ns.export.compact import load_field, write_file
-from nrfgs_ns.export.options import SCENE, CompactOptions, WebOptions
 from nrfgs_ns.export.web.guide import read_notes, read_tour
 from nrfgs_ns.export.web.page import page
 from nrfgs_ns.files import write_whole
@@ -29,40 +27,31 @@ from nrfgs_ns.trained.loading import finish, lost
 
 POSTER_SIDE = 960
 """Longest side of the poster, pixels."""
-MOST_WEIGHTS = 1024
-"""Vectors of four that a uniform block holds on every device with WebGL 2 (16 KiB)."""
 MOST_POINTS = 20_000
 """Splats from which a photograph's distance to its subject is estimated."""
 
 
-def export_web(
-    load_config: Path, output: Path, options: CompactOptions, web: WebOptions, measure: bool, report: Path | None
-) -> None:
+def export_web(load_config: Path, options: Web) -> None:
     """Write a page, or into a folder a page beside its scene; see `nrfgs export web --help`."""
-    if web.address is not None and not web.address.startswith(("https://", "http://")):
-        raise InputError(f"--address {web.address} is no web address. Give all of it, with https://.")
-    alone = output.suffix.lower() in (".html", ".htm")
+    output, alone, address = options.output, options.alone, options.address
+    if address is not None and not address.startswith(("https://", "http://")):
+        raise InputError(f"--address {address} is no web address. Give all of it, with https://.")
     with few_threads() as threads:
-        pipeline = load_field(load_config, measure)
+        pipeline = load_field(load_config, options.measure)
         names = picture_names(pipeline.datamanager.train_dataset.image_filenames)
-        guide = {"tour": read_tour(web.tour, names), "notes": read_notes(web.notes), "rotate": web.rotate}
+        guide = {"tour": read_tour(options.tour, names), "notes": read_notes(options.notes), "rotate": options.rotate}
         threads.suit_to(pipeline)
-        if (vectors := weight_vectors(pipeline.model.head)) > MOST_WEIGHTS:
-            raise InputError(
-                f"{load_config}: the field's weights fill {vectors} vectors of a shader, and some phones have room for "
-                f"{MOST_WEIGHTS}. Train with a smaller hidden_width, or fewer num_bands."
-            )
-        about, poster = surroundings(pipeline)
-        title = output.stem if web.title is None else web.title
+        about, poster = surroundings(pipeline, names)
+        title = output.stem if options.title is None else options.title
         picture = output.with_suffix(".jpg") if alone else output / "preview.jpg"
-        preview = "" if web.address is None else urljoin(web.address if alone else f"{web.address}/", picture.name)
-        around = len(page(about | guide, poster, b"" if alone else SCENE, title, web.author, preview).encode())
+        preview = "" if address is None else urljoin(address if alone else f"{address}/", picture.name)
+        around = len(page(about | guide, poster, b"" if alone else SCENE, title, options.author, preview).encode())
         with TemporaryDirectory() as temporary:
             file = Path(temporary) / SCENE
             total = lambda size: around + (-(-size // 3) * 4 if alone else size)  # noqa: E731 -- base64 in a page
-            _, numbers = write_file(pipeline, load_config, file, options, measure, total)
+            _, numbers = write_file(pipeline, load_config, file, options, total)
             scene = file.read_bytes()
-    text = page(about | guide, poster, scene if alone else SCENE, title, web.author, preview)
+    text = page(about | guide, poster, scene if alone else SCENE, title, options.author, preview)
     contents = {output: text.encode()} if alone else {output / SCENE: scene, output / "index.html": text.encode()}
     for path, content in (contents | ({picture: poster} if preview else {})).items():
         write_whole(path, content)
@@ -72,24 +61,14 @@ def export_web(
         f"{output}: {numbers['written']:,} splats, {size / 1e6:.2f} MB; 3DGS's PLY of as many splats has "
         f"{numbers['ply_bytes'] / 1e6:.2f} MB. It begins where {name} was taken."
     ]
-    lines += [lost(numbers)] if measure else []
+    lines += [lost(numbers)] if options.measure else []
     lines += [f"{picture}: the picture for {preview}."] if preview else []
     lines.append("Open it in a browser." if alone else "Put the folder on a web server: see docs/web.md.")
-    finish(lines, numbers | {"bytes": size, "scene_bytes": len(scene), "start": name}, report)
-
-
-def weight_vectors(head: NeuralResidualField) -> int:
-    """Vectors of four that the page's shader reads for a view (`viewWeights` in field.js)."""
-    total = 0
-    for name in branches(head.state_dict()):
-        units, inputs = getattr(head, name)[0].weight.shape
-        of_splat = head.config.latent_dim + 3 + (name == "low")  # latents, base colour, base opacity
-        total += -(-units // 4) * (inputs - of_splat + 4) + 1
-    return total
+    finish(lines, numbers | {"bytes": size, "scene_bytes": len(scene), "start": name}, options.report)
 
 
 @torch.no_grad()
-def surroundings(pipeline) -> tuple[dict[str, Any], bytes]:
+def surroundings(pipeline, names: list[str]) -> tuple[dict[str, Any], bytes]:
     """The scripts' values besides the scene, and a JPEG of the training view at which the page begins: the one that the
     model draws best (PSNR) of at most eight, evenly spaced.
 
@@ -122,7 +101,7 @@ def surroundings(pipeline) -> tuple[dict[str, Any], bytes]:
             "size": [int(cameras.width[i]), int(cameras.height[i])],
             "distance": distances[i] or typical,
         }
-        for i, name in enumerate(picture_names(data.train_dataset.image_filenames))
+        for i, name in enumerate(names)
     ]
     return {"photographs": photographs, "start": start, "up": _rounded(up)}, _jpeg(poster)
 

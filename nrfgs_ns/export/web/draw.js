@@ -273,11 +273,6 @@ class Painter {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  // Wait until the GPU has done what it was told.
-  finish() {
-    this.gl.readPixels(0, 0, 1, 1, this.gl.RGBA, this.gl.UNSIGNED_BYTE, new Uint8Array(4));
-  }
-
   _resize(width, height) {
     const { gl } = this;
     if (this.target && this.target.width === width && this.target.height === height) return;

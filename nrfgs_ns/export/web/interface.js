@@ -121,7 +121,7 @@ function offer() {
     listeners[kind].add(listener);
     return () => void listeners[kind].delete(listener);
   };
-  window.nrfgs = { version: VERSION_OF_INTERFACE, ready, on, ...calls, picture, measure };
+  window.nrfgs = { version: VERSION_OF_INTERFACE, ready, on, ...calls, picture };
 
   // The page around this one, whoever made it, may move the camera. It is not given pictures: another site's page must
   // not read what a browser shows only because its reader may see it.
@@ -147,34 +147,4 @@ function offer() {
     on("ready", () => tell("*")({ event: "ready" }));
     on("failed", ({ message }) => tell("*")({ event: "failed", message }));
   }
-}
-
-// Seconds for a picture, as the page is set, while the camera goes around: the field of all that is seen, projection,
-// blending, on the GPU until they are done. Splats are sorted beside that, in the worker: the last sorting's seconds.
-async function measure(count) {
-  await ready;
-  stop();
-  measuring = true;
-  let seconds = 0;
-  for (let i = 0; i < count; i++) {
-    turn(0.02, 0);
-    const start = performance.now();
-    painter.evaluate(fieldTask(), 0, painter.rows);
-    paint(1);
-    painter.finish();
-    seconds += (performance.now() - start) / 1000;
-    await new Promise((resolve) => requestAnimationFrame(resolve));
-  }
-  measuring = false;
-  fieldFor = null;
-  wake();
-  const { gl } = painter;
-  return {
-    seconds_per_picture: seconds / count,
-    seconds_to_sort: sortTook,
-    size: [canvas.width, canvas.height],
-    splats: painter.count,
-    renderer: gl.getParameter(gl.getExtension("WEBGL_debug_renderer_info")?.UNMASKED_RENDERER_WEBGL ?? gl.RENDERER),
-    browser: navigator.userAgent,
-  };
 }

@@ -157,9 +157,8 @@ function answer(post) {
       } else if (pick) {
         post({ picked: order.along(pick) });
       } else {
-        const start = performance.now(), rows = order.sorted(camera);
-        const seconds = (performance.now() - start) / 1000;
-        post({ sorted: { rows, seconds, along: order.along(camera) } }, [rows.buffer]);
+        const rows = order.sorted(camera);
+        post({ sorted: { rows, along: order.along(camera) } }, [rows.buffer]);
       }
     } catch (error) {
       reading = null;
