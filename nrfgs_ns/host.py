@@ -40,8 +40,10 @@ PRIVATE = {
     # A control is set up by the viewer and triggers a new picture.
     "nerfstudio.viewer.viewer_elements:ViewerControl": "_setup",
     "nerfstudio.viewer.viewer:Viewer": "_trigger_rerender",
-    # Requests and messages are checked, and icons are read at once (viewer/).
-    "viser": "_client_autobuild _gui_api _gui_handles _icons _messages",
+    # Requests and messages are checked, icons read from an archive that stays open, and pictures written without
+    # imports (viewer/).
+    "viser": "_client_autobuild _gui_api _gui_handles _icons _messages _scene_api",
+    "viser._scene_api": "iio",
     "viser.infra": "_infra",
     "viser.infra:WebsockServer": "_background_worker _http_server_root",
     "viser:ViserServer": "_share_tunnel _websock_server",

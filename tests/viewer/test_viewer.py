@@ -6,6 +6,7 @@ from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
 
+import imageio.v3
 import numpy as np
 import pytest
 import torch
@@ -19,7 +20,7 @@ from PIL import Image
 from short_trainings import assert_same_training, checkpoint_of, command_line, set_up, untrained
 from small_capture import Capture
 from torch.testing import assert_close
-from viser import _icons
+from viser import _icons, _scene_api
 
 from nrfgs_ns.appearance.head import Field, SplatAppearance
 from nrfgs_ns.appearance.nrf import NrfConfig
@@ -339,6 +340,7 @@ def test_a_training_s_photographs_are_not_read_again(pipeline, tiny_scene, tmp_p
     get_data, threads = NrfgsInputDataset.get_data, torch.get_num_threads()
     monkeypatch.setattr(NrfgsInputDataset, "get_data", lambda *args, **more: reads.append(1) or get_data(*args, **more))
     log, lock = tmp_path / "log", threading.Lock()
+    monkeypatch.setattr(Image, "init", lambda: pytest.fail("imports all of Pillow's formats"))
     viewer = Viewer(ViewerConfig(), log, datapath=tiny_scene, pipeline=pipeline, train_lock=lock)
     scene = viewer.viser_server.scene
     add = scene.add_camera_frustum
@@ -355,8 +357,12 @@ def test_a_training_s_photographs_are_not_read_again(pipeline, tiny_scene, tmp_p
         viewer.viser_server.stop()
 
 
-def test_icons_are_visers():
+def test_icons_and_pictures_are_visers(pipeline, monkeypatch):
     assert all(start.icon(name) == _icons.svg_from_icon(name) for name in ("123", "camera", "zzz"))
+    picture = np.random.default_rng(0).integers(0, 256, (24, 30, 3), np.uint8)
+    ours = [_scene_api._encode_image_binary(picture, kind) for kind in ("jpeg", "png")]
+    monkeypatch.setattr(_scene_api, "iio", imageio.v3)
+    assert ours == [_scene_api._encode_image_binary(picture, kind) for kind in ("jpeg", "png")]
 
 
 def test_large_photographs_come_small(tmp_path, monkeypatch):
