@@ -47,9 +47,9 @@ PRIVATE = {
     "viser.infra": "_infra",
     "viser.infra:WebsockServer": "_background_worker _http_server_root",
     "viser:ViserServer": "_share_tunnel _websock_server",
-    # Growth by gradients: which splats are split, duplicated or pruned. Statistics and resets are this package's own:
-    # their layout differs between 1.4 and 1.5, and 1.5.3 never resets opacities (`0 & step` binds before `==`).
-    "gsplat.strategy:DefaultStrategy": "_grow_gs _prune_gs",
+    # Growth by gradients: which splats are split or duplicated. Statistics and resets are this package's own: their
+    # layout differs between 1.4 and 1.5, and 1.5.3 never resets opacities (`0 & step` binds before `==`).
+    "gsplat.strategy:DefaultStrategy": "_grow_gs",
     # Rows of the table with their optimisers' moments.
     "gsplat.strategy.ops": "_update_param_with_optimizer",
 }

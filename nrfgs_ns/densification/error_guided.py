@@ -233,35 +233,22 @@ def split(splats: Splats, optimizers: Optimizers, rows: Tensor, places: Tensor) 
     half = halves(splats, rows, torch.randint(0, 2, (len(rows), 3), device=rows.device) * 2.0 - 1.0)
     taken = len(places)
 
-    def values(name: str, old: Tensor, sign: float) -> Tensor:
+    changed, added = torch.cat([rows, places]), {}
+    for name, parameter in splats.items():
+        first = second = half[name] if name in half else parameter.data[rows]
         if name == "means":
-            return old[rows] + sign * half["offset"]
-        return half[name] if name in half else old[rows]
-
-    def overwrite(name: str, table: Tensor) -> Tensor:
-        first, second = values(name, table, 1.0), values(name, table, -1.0)
-        table[rows] = first
-        table[places] = second[:taken]
-        return second[taken:]
-
-    def clear(table: Tensor) -> None:
-        table[torch.cat([rows, places])] = 0.0
-
+            first, second = first + half["offset"], first - half["offset"]
+        parameter.data[changed] = torch.cat([first, second[:taken]])
+        added[name] = second[taken:]
+        for value in optimizers[name].state.get(parameter, {}).values():
+            if value.dim() > 0:
+                value[changed] = 0.0
     if taken == len(rows):
-        for name, parameter in splats.items():
-            overwrite(name, parameter.data)
-            for value in optimizers[name].state.get(parameter, {}).values():
-                if value.dim() > 0:
-                    clear(value)
         return
 
-    def grown(name: str, old: Tensor) -> Parameter:
-        table = old.detach().clone()
-        return Parameter(torch.cat([table, overwrite(name, table)]))
-
     def moments(_: str, old: Tensor) -> Tensor:
-        table = old.clone()
-        clear(table)
-        return torch.cat([table, old.new_zeros(len(rows) - taken, *old.shape[1:])])
+        return torch.cat([old, old.new_zeros(len(rows) - taken, *old.shape[1:])])
 
-    _update_param_with_optimizer(grown, moments, splats, optimizers)
+    _update_param_with_optimizer(
+        lambda name, old: Parameter(torch.cat([old.detach(), added[name]])), moments, splats, optimizers
+    )

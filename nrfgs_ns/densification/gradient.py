@@ -43,9 +43,9 @@ class GradientConfig(DensificationConfig):
         super().check()
         self.require(self.reset_alpha_every >= 1, "reset_alpha_every", "at least 1")
 
-    def _rules(self, **thresholds: Any) -> "PruneBySeenOpacity":
+    def _rules(self, **thresholds: Any) -> DefaultStrategy:
         """Rules of gsplat with these thresholds, under the names of its `DefaultStrategy`."""
-        return PruneBySeenOpacity(
+        return DefaultStrategy(
             refine_start_iter=self.warmup_length,
             refine_stop_iter=self.stop_split_at,
             refine_every=self.refine_every,
@@ -68,8 +68,6 @@ class Splatfacto(GradientConfig):
         super().check()
         resets = "below 0.5 and above 0, since a reset is to twice as much"
         self.require(0 < self.cull_alpha_thresh < 0.5, "cull_alpha_thresh", resets)
-        for name, fixed in (("use_absgrad", True), ("stop_screen_size_at", 4000)):  # in an older config.yml
-            self.require(getattr(self, name, fixed) == fixed, name, f"{fixed}, its only value")
 
     def build(self, num_images: int, num_views: int, scene_unit: float) -> "GradientDensification":
         rules = self._rules(
@@ -93,35 +91,7 @@ class Original(GradientConfig):
     name: ClassVar[str] = "original"
 
     def build(self, num_images: int, num_views: int, scene_unit: float) -> "GradientDensification":
-        rules = self._rules(
-            prune_opa=0.005,
-            grow_grad2d=2e-4,
-            grow_scale3d=0.01,  # in extents of the cameras, as the next
-            prune_scale3d=0.1,
-            refine_scale2d_stop_iter=0,
-            pause_refine_after_reset=0,
-            absgrad=False,
-        )
-        return OriginalDensification(self, rules)
-
-
-class PruneBySeenOpacity(DefaultStrategy):
-    """gsplat's strategy, except that `seen_opacity` decides which splats are pruned."""
-
-    seen_opacity: Callable[[Tensor], Tensor]
-    """logits [N, 1] -> opacities [N]"""
-
-    @torch.no_grad()
-    def _prune_gs(self, params, optimizers, state, step) -> int:
-        prune = self.seen_opacity(params["opacities"]) < self.prune_opa
-        if step > self.reset_every:
-            prune |= params["scales"].exp().amax(dim=-1) > self.prune_scale3d * state["scene_scale"]
-            if step < self.refine_scale2d_stop_iter:
-                prune |= state["radii"] > self.prune_scale2d
-        count = int(prune.sum())
-        if count > 0:
-            remove(params, optimizers, state, prune)
-        return count
+        return OriginalDensification(self, self._rules())  # gsplat's default thresholds are 3DGS's
 
 
 class GradientDensification(Densification):
@@ -133,10 +103,9 @@ class GradientDensification(Densification):
         scene_unit: world units in a scene unit, which sizes are measured in.
     """
 
-    def __init__(self, config: GradientConfig, strategy: PruneBySeenOpacity, scene_unit: float = 1.0):
+    def __init__(self, config: GradientConfig, strategy: DefaultStrategy, scene_unit: float = 1.0):
         super().__init__(config)
         self.strategy = strategy
-        strategy.seen_opacity = self.seen_opacity
         self.gradients = "absolute" if strategy.absgrad else "signed"
         self.bounds = {name: getattr(strategy, name) for name in STRATEGY_BOUNDS}
         self.threshold, self.widest = strategy.grow_grad2d, strategy.grow_scale2d
@@ -188,7 +157,7 @@ class GradientDensification(Densification):
         grown = len(splats["means"])
         pruned = 0
         if not self.budget or step % strategy.reset_every >= RECOVERY * strategy.refine_every:
-            pruned = strategy._prune_gs(splats, optimizers, state, step)
+            pruned = self._prune(step, splats, optimizers)
         if self.verbose:
             print(f"Step {step}: {duplicated} GSs duplicated, {split} GSs split. Now having {grown} GSs.")
             print(f"Step {step}: {pruned} GSs pruned. Now having {len(splats['means'])} GSs.")
@@ -196,6 +165,19 @@ class GradientDensification(Densification):
             if name in state:
                 state[name].zero_()
         torch.cuda.empty_cache()
+
+    def _prune(self, step: int, splats, optimizers) -> int:
+        """Remove splats by gsplat's rules, except that `seen_opacity` counts; return their number."""
+        strategy, state = self.strategy, self.state
+        prune = self.seen_opacity(splats["opacities"]) < strategy.prune_opa
+        if step > strategy.reset_every:
+            prune |= splats["scales"].exp().amax(dim=-1) > strategy.prune_scale3d * state["scene_scale"]
+            if step < strategy.refine_scale2d_stop_iter:
+                prune |= state["radii"] > strategy.prune_scale2d
+        count = int(prune.sum())
+        if count > 0:
+            remove(splats, optimizers, state, prune)
+        return count
 
     def _threshold_for_budget(self, step: int, gradients: Tensor) -> float:
         """The gradient above which splats grow at this refinement, so that growth ends with the budget's number.

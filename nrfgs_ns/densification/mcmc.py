@@ -36,9 +36,7 @@ SCALE_REGULARISATION = 0.01
 MAX_COPIES = 51
 """n is cut off here, as in gsplat: the alternating sum loses its digits as n grows."""
 NOISE_SHARPNESS = 100.0
-"""The noise's sigmoid falls from 1 to 0 around opacity 0.005 with this slope: live splats hold still."""
-NOISE_OPACITY = 0.005
-"""Opacity at which the noise is half as large as of an invisible splat."""
+"""The noise's sigmoid falls from 1 to 0 around `MIN_OPACITY` with this slope: live splats hold still."""
 
 
 @dataclass
@@ -219,7 +217,7 @@ def add_noise(splats: Splats, size: float, opacities: Tensor) -> None:
         size: learning rate of the means times the noise's own.
         opacities: the splats', as they are seen, [N] in [0, 1].
     """
-    gate = torch.sigmoid(-NOISE_SHARPNESS * (opacities - NOISE_OPACITY))
+    gate = torch.sigmoid(-NOISE_SHARPNESS * (opacities - MIN_OPACITY))
     noise = torch.randn_like(splats["means"]) * (gate * size)[:, None]
     axes = normalized_quat_to_rotmat(F.normalize(splats["quats"], dim=-1))
     along = torch.einsum("nij,ni->nj", axes, noise) * (2.0 * splats["scales"]).exp()

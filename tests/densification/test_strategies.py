@@ -131,15 +131,6 @@ def test_options_that_cannot_work_are_refused(text, says):
         strategy_from(text)
 
 
-@pytest.mark.parametrize("name, kept, changed", [("use_absgrad", True, False), ("stop_screen_size_at", 4000, 0)])
-def test_an_older_configs_option_is_refused_unless_it_changes_nothing(name, kept, changed):
-    (older := strategy_from("splatfacto")).__dict__[name] = kept
-    older.check()
-    setattr(older, name, changed)
-    with pytest.raises(InputError, match=f"{name} is {changed}; it must be {kept}"):
-        older.check()
-
-
 @pytest.mark.skipif(gsplat_version() >= (1, 5), reason="gsplat 1.5's strategy reads two radii, and resets no opacity")
 def test_statistics_growth_and_resets_are_gsplats():
     """Splatfacto's rules step by step, and gsplat's own strategy beside them: the same numbers, to the bit."""

@@ -154,10 +154,10 @@ def averaged(scene: Path, folder: Path) -> None:
 
     def lopsided(trainer) -> None:
         """Only the second device refines."""
-        strategy = trainer.pipeline.model.densification.strategy
-        strategy.pause_refine_after_reset = 0
+        rules = trainer.pipeline.model.densification
+        rules.strategy.pause_refine_after_reset = 0
         if main:
-            strategy._grow_gs, strategy._prune_gs = lambda *_: (0, 0), lambda *_: 0
+            rules.strategy._grow_gs, rules._prune = lambda *_: (0, 0), lambda *_: 0
 
     def watch(trainer) -> None:
         lopsided(trainer)
