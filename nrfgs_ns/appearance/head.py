@@ -16,12 +16,15 @@ from collections.abc import Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from nrfgs_ns.errors import InputError
+
+if TYPE_CHECKING:
+    from nrfgs_ns.rasterizer import View
 
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi))."""
@@ -170,18 +173,6 @@ class AppearanceHead(nn.Module, ABC):
         return None
 
 
-class VisibleSplats(Protocol):
-    """The M splats that a view shows, and the camera centres that they are seen from."""
-
-    @property
-    def visible(self) -> Tensor:
-        """Rows of the table, int64 [M]; a row occurs once for each camera that sees the splat."""
-
-    @property
-    def center(self) -> Tensor:
-        """Camera centres in world coordinates, [3] or [M, 3]."""
-
-
 class Field(NamedTuple):
     """A head and the table of the N splats that it colours."""
 
@@ -189,11 +180,11 @@ class Field(NamedTuple):
     splats: Mapping[str, Tensor]
     """"means", "opacities" and the head's `splat_params`, [N, ...]"""
 
-    def seen_from(self, view: VisibleSplats) -> SplatAppearance:
+    def seen_from(self, view: "View") -> SplatAppearance:
         """Colours and opacities of the M splats that a view sees."""
         return self.head(self.splats, view.visible, view.center)
 
-    def base_of(self, view: VisibleSplats) -> SplatAppearance:
+    def base_of(self, view: "View") -> SplatAppearance:
         """The part of `seen_from` that does not depend on the camera."""
         return self.head.base_appearance(self.splats, view.visible)
 

@@ -27,7 +27,7 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor, nn
 from torch.nn.functional import logsigmoid
 
-from nrfgs_ns.appearance.head import Field, SplatAppearance, ViewNoise, VisibleSplats
+from nrfgs_ns.appearance.head import Field, SplatAppearance, ViewNoise
 from nrfgs_ns.appearance.reduce import latent_basis, with_components, with_rank
 from nrfgs_ns.compact.encode import drawable
 from nrfgs_ns.compact.tables import COLUMNS, MOST_BITS, Grid, morton, splats_of, steps_of, tables_of
@@ -35,6 +35,7 @@ from nrfgs_ns.data.views import camera_spacing
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.model.harmonics_fit import look_through
 from nrfgs_ns.model.loss import photometric
+from nrfgs_ns.rasterizer import View
 
 EVERY = 4
 """Steps between two counts of the bits, which take longer than an image."""
@@ -185,7 +186,7 @@ class Gated(NamedTuple):
     field: Field
     gates: Tensor
 
-    def seen_from(self, view: VisibleSplats) -> SplatAppearance:
+    def seen_from(self, view: View) -> SplatAppearance:
         appearance = self.field.seen_from(view)
         return appearance._replace(opacities=appearance.opacities * self.gates[view.visible])
 
