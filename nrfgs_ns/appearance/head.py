@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from nrfgs_ns.errors import InputError
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # the rasterizer imports this module
     from nrfgs_ns.rasterizer import View
 
 SH_C0 = 0.28209479177387814
