@@ -37,6 +37,8 @@ class GsnbConfig(ShConfig):
     """Spherical harmonics and a learnt basis. The defaults are the paper's."""
 
     _target: type = field(default_factory=lambda: NeuralBasis)
+    raw_direction: bool = True
+    """whether the direction itself stands beside its bands; its reference has the bands alone, 36 inputs"""
 
 
 class NeuralBasis(SphericalHarmonics):
@@ -49,8 +51,8 @@ class NeuralBasis(SphericalHarmonics):
         super().__init__(config)
         self.ramp = 1.0
         """rho: weight of the learnt basis."""
-        widths = 3 + BAND_DIM * BANDS, HIDDEN_WIDTH, HIDDEN_WIDTH, num_bases(config.degree)
-        self.basis = nn.Sequential(*layers(*widths), nn.Tanh())
+        inputs = 3 * config.raw_direction + BAND_DIM * BANDS
+        self.basis = nn.Sequential(*layers(inputs, HIDDEN_WIDTH, HIDDEN_WIDTH, num_bases(config.degree)), nn.Tanh())
 
     def set_step(self, step: int) -> None:
         super().set_step(step)
@@ -63,7 +65,8 @@ class NeuralBasis(SphericalHarmonics):
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
         means, coefficients, opacities = self.rows(splats, visible, camera_centers)
         directions = unit_vectors(means - camera_centers, NEAR * self.scene_unit)
-        learnt = self.basis(torch.cat(fourier_bands(directions, BANDS), dim=-1))  # [M, B]
+        inputs = torch.cat(fourier_bands(directions, BANDS), dim=-1)
+        learnt = self.basis(inputs if self.config.raw_direction else inputs[:, 3:])  # [M, B]
         colors = eval_sh(self.active_degree, directions, coefficients)
         colors = colors + self.ramp * (learnt[..., None] * coefficients).sum(dim=1)
         return SplatAppearance((colors + 0.5).clamp_min(0.0), opacities)

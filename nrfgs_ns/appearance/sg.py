@@ -31,8 +31,6 @@ from nrfgs_ns.appearance.head import (
     unit_vectors,
 )
 
-LOBES = 3
-"""L: lobes of each splat."""
 START_STEP = 2000
 """Training step of the first lobes; before it only the base colour is trained."""
 INITIAL_SHARPNESS = 2.0
@@ -45,6 +43,12 @@ class SgConfig(AppearanceHeadConfig):
     """Spherical Gaussians with free axes."""
 
     _target: type = field(default_factory=lambda: SphericalGaussians)
+    lobes: int = 3
+    """L: lobes of each splat, 1 to 6. They start about x, y, z, -x, -y, -z, in this order."""
+
+    def validate(self) -> None:
+        # Two lobes that started alike would get the same gradients and stay alike.
+        self.require(1 <= self.lobes <= 6, "lobes", "1 to 6, so that no two lobes start about the same axis")
 
 
 class SphericalGaussians(AppearanceHead):
@@ -57,10 +61,14 @@ class SphericalGaussians(AppearanceHead):
     def splat_params(self, rgb: Tensor) -> dict[str, Tensor]:
         """Base colours "features_dc" [N, 3]; axes "sg_axes" [N, L, 3], of any length but zero; "sg_sharpness" [N, L],
         of any sign; amplitudes "sg_colors" [N, L, 3], in units of white."""
-        axes = torch.eye(LOBES, device=rgb.device).repeat(len(rgb), 1, 1)
-        sharpness = torch.full((len(rgb), LOBES), INITIAL_SHARPNESS, device=rgb.device)
-        stored = {"sg_axes": axes, "sg_sharpness": sharpness, "sg_colors": torch.zeros_like(axes)}
-        return super().splat_params(rgb) | stored
+        lobes = self.config.lobes
+        axes = torch.eye(3, device=rgb.device)
+        return {
+            **super().splat_params(rgb),
+            "sg_axes": torch.cat([axes, -axes])[:lobes].repeat(len(rgb), 1, 1),
+            "sg_sharpness": torch.full((len(rgb), lobes), INITIAL_SHARPNESS, device=rgb.device),
+            "sg_colors": torch.zeros(len(rgb), lobes, 3, device=rgb.device),
+        }
 
     def set_step(self, step: int) -> None:
         self.active = step >= START_STEP

@@ -14,7 +14,7 @@ Grid and network have the reference's optimiser, Adam at 1e-3 without a schedule
 included, which the reference switches off. Pruning sees sigmoid(o), except in `mcmc` (the largest opacity shown).
 
 The hash grid interpolates features of a position from lattices of growing resolution. Level l has N_l = floor(N_0 b^l)
-lattice steps in a scene unit and a table of T vectors of four features. At position x it interpolates trilinearly
+lattice steps per unit of length and a table of T vectors of four features. At position x it interpolates trilinearly
 between the eight lattice points around N_l x; lattice point (i, j, k) has row
 
     (i p_1) xor (j p_2) xor (k p_3)  mod T,    p = 1, 2654435761, 805459861
@@ -24,12 +24,13 @@ SIGGRAPH 2022). Positions are coordinates in scene units, not normalised to a cu
 lattice, in two's complement, and nothing is clamped. T is a power of two, so that modulo T the hash is the one of
 unsigned 32-bit arithmetic.
 
-On level 0, points are not hashed but numbered: its lattice over [-1, 1]^3, to which nerfstudio scales its scenes, has
-as many points as the table has rows, S^3 = T with S = 2 N_0:
+Where a level's lattice over [-1, 1]^3, to which nerfstudio scales its scenes, has no more points than the table has
+rows, (2 N_l)^3 <= T, points are not hashed but numbered:
 
-    (i mod S) + S (j mod S) + S^2 (k mod S).
+    (i mod 2 N_l) + 2 N_l (j mod 2 N_l) + (2 N_l)^2 (k mod 2 N_l).
 
-Beyond the cube this level repeats itself every 2 units; the others tell the repetitions apart.
+Beyond the cube such a level repeats itself every 2 units; the hashed levels tell the repetitions apart. With N_0 = 16
+and T = 2^15 level 0 is of this kind, and fills its table exactly.
 """
 
 from collections.abc import Callable, Mapping
@@ -43,10 +44,6 @@ from nrfgs_ns.appearance.sh import ShConfig, SphericalHarmonics, eval_sh
 
 HIDDEN_WIDTH = 32
 """Units of each hidden layer."""
-RESOLUTIONS = (16, 24, 36, 54)
-"""N_l: lattice steps in a scene unit, floor(16 * 1.5^l)."""
-TABLE_SIZE = 2**15
-"""T: rows of each level's table."""
 PRIMES = (1, 2654435761, 805459861)
 """The hash's multipliers for x, y, z."""
 FEATURES = 4
@@ -60,6 +57,12 @@ class VdgsConfig(ShConfig):
     """Spherical harmonics and a view-dependent factor. The defaults are the paper's."""
 
     _target: type = field(default_factory=lambda: ViewDirectionFactors)
+    grid_base_resolution: int = 16
+    """lattice steps per scene unit on the coarsest level."""
+
+    def validate(self) -> None:
+        super().validate()
+        self.require(self.grid_base_resolution >= 1, "grid_base_resolution", "at least 1")
 
 
 class ViewDirectionFactors(SphericalHarmonics):
@@ -70,8 +73,8 @@ class ViewDirectionFactors(SphericalHarmonics):
 
     def __init__(self, config: VdgsConfig):
         super().__init__(config)
-        self.grid = HashGrid()
-        self.network = nn.Sequential(*layers(3 + len(RESOLUTIONS) * FEATURES, HIDDEN_WIDTH, HIDDEN_WIDTH, 1))
+        self.grid = HashGrid(config.grid_base_resolution)
+        self.network = nn.Sequential(*layers(3 + self.grid.width, HIDDEN_WIDTH, HIDDEN_WIDTH, 1))
 
     def forward(self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor) -> SplatAppearance:
         means, coefficients, opacities = self.rows(splats, visible, camera_centers)
@@ -91,16 +94,28 @@ class ViewDirectionFactors(SphericalHarmonics):
 
 
 class HashGrid(nn.Module):
-    """Features of positions, [M, 3] -> [M, levels * 4]."""
+    """Features of positions, [M, 3] -> [M, levels * 4].
 
-    def __init__(self):
+    Args:
+        base_resolution: N_0, lattice steps per unit of length on level 0.
+        levels: number of lattices, >= 1.
+        log2_table_size: log2 T, rows of each level's table.
+        per_level_scale: b, ratio of neighbouring levels' resolutions, >= 1.
+    """
+
+    def __init__(
+        self, base_resolution: int, *, levels: int = 4, log2_table_size: int = 15, per_level_scale: float = 1.5
+    ) -> None:
         super().__init__()
-        levels, side = len(RESOLUTIONS), 2 * RESOLUTIONS[0]
-        self.table = nn.Parameter(torch.empty(levels * TABLE_SIZE, FEATURES).uniform_(-1.0, 1.0) * INITIAL_RANGE)
-        self.register_buffer("resolutions", torch.tensor(RESOLUTIONS, dtype=torch.float32), persistent=False)
-        self.register_buffer("strides", torch.tensor([1, side, side**2])[:, None], persistent=False)
-        self.register_buffer("primes", torch.tensor(PRIMES)[:, None], persistent=False)
-        self.register_buffer("offsets", torch.arange(levels) * TABLE_SIZE, persistent=False)
+        self.table_size = 2**log2_table_size
+        self.width = levels * FEATURES
+        steps = [int(base_resolution * per_level_scale**level) for level in range(levels)]
+        sides = [2 * n for n in steps if (2 * n) ** 3 <= self.table_size]  # of the numbered levels: the first ones
+        self.table = nn.Parameter(torch.empty(levels * self.table_size, FEATURES).uniform_(-1.0, 1.0) * INITIAL_RANGE)
+        self.register_buffer("resolutions", torch.tensor(steps, dtype=torch.float32), persistent=False)
+        self.register_buffer("primes", torch.tensor(PRIMES), persistent=False)
+        self.register_buffer("sides", torch.tensor(sides, dtype=torch.int64)[:, None, None], persistent=False)
+        self.register_buffer("offsets", torch.arange(levels) * self.table_size, persistent=False)
 
     def forward(self, positions: Tensor) -> Tensor:
         """Interpolated features [M, levels * 4], level by level, of positions [M, 3] in scene units."""
@@ -115,9 +130,11 @@ class HashGrid(nn.Module):
 
     def _rows(self, coordinates: Tensor) -> Tensor:
         """Rows of the table, [M, L, 8], for the lower and upper lattice coordinates, int64 [M, L, 3, 2]."""
-        numbered = coordinates[:, :1].remainder(2 * RESOLUTIONS[0]) * self.strides
-        hashed = coordinates[:, 1:] * self.primes
-        rows = [_corners(numbered, torch.add), _corners(hashed, torch.bitwise_xor) & (TABLE_SIZE - 1)]
+        numbered = len(self.sides)
+        stride = torch.cat([self.sides**0, self.sides, self.sides**2], dim=1)  # [numbered, 3, 1]
+        in_cube = coordinates[:, :numbered].remainder(self.sides) * stride
+        hashed = coordinates[:, numbered:] * self.primes[:, None]
+        rows = [_corners(in_cube, torch.add), _corners(hashed, torch.bitwise_xor) & (self.table_size - 1)]
         return torch.cat(rows, dim=1) + self.offsets[:, None]
 
 

@@ -52,7 +52,7 @@ def gsnb_by_hand(head, splats, visible, centers, ramp):
         x = splats["means"][row]
         d = (x - center) / (x - center).norm()
         waves = [[torch.sin(2**k * math.pi * d), torch.cos(2**k * math.pi * d)] for k in range(6)]
-        h = torch.cat([d, *sum(waves, [])])
+        h = torch.cat([d] * head.config.raw_direction + sum(waves, []))
         for layer in (first, second):
             h = torch.nn.functional.leaky_relu(layer.weight @ h + layer.bias, 0.01)
         phi = torch.tanh(third.weight @ h + third.bias)
@@ -62,9 +62,9 @@ def gsnb_by_hand(head, splats, visible, centers, ramp):
     return torch.stack(colors)
 
 
-@pytest.mark.parametrize("step, ramp", [(3000, 0.6), (5000, 1.0), (30_000, 1.0)])
-def test_gsnb_matches_the_formulas(step, ramp):
-    head = awake(GsnbConfig())
+@pytest.mark.parametrize("raw, step, ramp", [(True, 3000, 0.6), (True, 5000, 1.0), (False, 30_000, 1.0)])
+def test_gsnb_matches_the_formulas(raw, step, ramp):
+    head = awake(GsnbConfig(raw_direction=raw))
     head.set_step(step)
     splats, visible, centers = scene(head)
     colors, opacities = head(splats, visible, centers)
@@ -101,8 +101,9 @@ def sg_by_hand(splats, visible, centers):
     return torch.tensor(colors, dtype=torch.double)
 
 
-def test_sg_matches_the_formula():
-    head = awake(SgConfig())
+@pytest.mark.parametrize("lobes", [1, 3, 6])
+def test_sg_matches_the_formula(lobes):
+    head = awake(SgConfig(lobes=lobes))
     splats, visible, centers = scene(head)
     splats["sg_sharpness"][::2] *= -1
     colors, opacities = head(splats, visible, centers)
@@ -213,7 +214,7 @@ def test_vdgs_matches_the_formulas_and_shows_what_the_view_takes_from_opacity():
 @pytest.fixture
 def grid():
     torch.manual_seed(0)
-    grid = HashGrid().double()
+    grid = HashGrid(16).double()
     grid.table.data.normal_()
     return grid
 
