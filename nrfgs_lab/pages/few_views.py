@@ -39,23 +39,19 @@ def today(scene: str, name: str, strategy: str = OWN) -> Trainings:
 
 def twins(trial: str, base: str) -> list[list[dict]]:
     """Pairs of records of a trial with a twin and of one without, of the same seed, on the same held-out views."""
-    rows = bench_rows("twin")
-    others = {place: rows.get((*place[:2], base)) for place in rows if place[2] == trial}
-    pairs = [(rows[place].records, other.records) for place, other in others.items() if other]
+    rows = {place: row.records for place, row in bench_rows("twin").items()}
+    pairs = [(row, rows.get((*place[:2], base), {})) for place, row in rows.items() if place[2] == trial]
     return [[one[seed], other[seed]] for one, other in pairs for seed in one if seed in other]
 
 
 def twin_gain(trial: str, base: str) -> str:
     """Mean change by a twin over sets of held-out views, with its standard error, and how many sets gain."""
-    changes = []
-    for pair in twins(trial, base):
-        tests = [one["measured"]["test"] for one in pair]
-        worst = [min(view["psnr"] for view in test["per_image"]) for test in tests]
-        changes.append([*(tests[0][metric] - tests[1][metric] for metric in ("psnr", "ssim")), worst[0] - worst[1]])
-    psnr, ssim, worst = zip(*changes, strict=True)
+    tests = [[one["measured"]["test"] for one in pair] for pair in twins(trial, base)]
+    psnr, ssim = ([one[metric] - other[metric] for one, other in tests] for metric in ("psnr", "ssim"))
+    worst = [[min(view["psnr"] for view in test["per_image"]) for test in pair] for pair in tests]
     better = "{} and {} of {} sets".format(*(sum(one > 0 for one in gains) for gains in (psnr, ssim)), len(psnr))
     gain = f"{signed(fmean(psnr), 2)}±{stdev(psnr) / len(psnr) ** 0.5:.2f} dB, {signed(fmean(ssim), 4)} SSIM"
-    return f"{gain} (better on {better}), {signed(fmean(worst), 1)} dB in the worst view"
+    return f"{gain} (better on {better}), {signed(fmean(one - other for one, other in worst), 1)} dB in the worst view"
 
 
 def twin_tests(kind: str) -> str:
@@ -67,12 +63,6 @@ def twin_tests(kind: str) -> str:
         better = sum(one["psnr"] > other["psnr"] for one, other in zip(*both, strict=True))
         cells.append(f"`{scene}` {signed(psnr, 2)} dB, {signed(ssim, 4)} SSIM ({better}/{len(both[0])})")
     return "; ".join(cells)
-
-
-def twin_spread(scene: str) -> str:
-    """Difference between the best and the worst seed of the field on test views, with a twin and without."""
-    values = [[one["psnr"] for one in of(scene, FIELD)] for of in (today, alone)]
-    return "{:.1f} instead of {:.1f} dB".format(*(max(seeds) - min(seeds) for seeds in values))
 
 
 def twin_cost(of: str) -> str:
@@ -203,7 +193,6 @@ BLOCKS = {
     "captures.rules_gain": rules_gain,
     "captures.twin": twin_gain,
     "captures.twin_tests": twin_tests,
-    "captures.twin_spread": twin_spread,
     "captures.twin_cost": twin_cost,
     "captures.floaters": floaters,
     "captures.today": lambda *place: _run({of: mean(today(*place), of) for of in ("psnr", "ssim", "splats")}),
