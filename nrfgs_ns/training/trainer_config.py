@@ -79,11 +79,11 @@ class NrfgsTrainerConfig(TrainerConfig):
             name = "pipeline.datamanager.train_cameras_sampling_strategy"
             raise InputError(f"{name} is {order}; these methods draw cameras at random. Leave it out.")
         lowest = {
-            "time_budget schedule_steps pipeline.datamanager.camera_res_scale_factor": positive,
-            "max_num_iterations average_steps pipeline.datamanager.max_thread_workers machine.seed": 0,
-            "logging.steps_per_log machine.num_devices machine.num_machines": 1,
+            positive: ("time_budget", "schedule_steps", "pipeline.datamanager.camera_res_scale_factor"),
+            0: ("max_num_iterations", "average_steps", "pipeline.datamanager.max_thread_workers", "machine.seed"),
+            1: ("logging.steps_per_log", "machine.num_devices", "machine.num_machines"),
         }
-        limits = [(name, attrgetter(name)(self), low) for names, low in lowest.items() for name in names.split()]
+        limits = [(name, attrgetter(name)(self), low) for low, names in lowest.items() for name in names]
         for group, parts in self.optimizers.items():
             name = f"optimizers.{group}"
             schedule = parts["scheduler"]
