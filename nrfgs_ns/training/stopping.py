@@ -59,7 +59,7 @@ def heard_signals(request: StopRequest) -> Iterator[None]:
         yield
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            signal.signal(number, handler or signal.SIG_DFL)  # None: not one of Python's
 
 
 def is_out_of_memory(error: BaseException) -> bool:
