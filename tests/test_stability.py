@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hard trainings end finite (docs/troubleshooting.md)."""
+"""The catalogue of extremes holds, and its tests exist; hard trainings end finite (docs/troubleshooting.md)."""
 
+import ast
 import json
 import shutil
 from functools import partial
@@ -13,10 +14,24 @@ from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 from short_trainings import command_line, trained
 from small_capture import rescale
+from stability_catalogue import CATALOGUE
 
 from nrfgs_lab.scenes import SceneConfig, write_scene
 from nrfgs_lab.training_run import evaluate
 from nrfgs_ns.method_config import nrfgs
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.mark.parametrize("quantity", CATALOGUE, ids=lambda quantity: quantity.name)
+def test_check_holds(quantity):
+    assert quantity.check() is True
+
+
+def test_every_test_that_is_named_exists():
+    for file, name in {tuple(test.split("::")) for quantity in CATALOGUE for test in quantity.tests}:
+        tree = ast.parse((ROOT / file).read_text())
+        assert name in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}, f"{file}::{name}"
 
 
 def paint(folder: Path, value: int) -> None:

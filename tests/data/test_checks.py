@@ -28,6 +28,7 @@ def to_one_place(capture):
 
 BROKEN = {  # what is done to the data set -> what the message must say
     "no file_path": (lambda c: c.meta["frames"][3].pop("file_path"), "transforms.json frames[3] file_path remove"),
+    "no pose": (lambda c: c.meta["frames"][3].pop("transform_matrix"), "transform_matrix 006.png remove"),
     "3 x 4 pose": (lambda c: c.meta["frames"][2]["transform_matrix"].pop(), "transform_matrix 007.png 4 x 4 last row"),
     "NaN in pose": (lambda c: pose(c, 0, 3, float("nan")), "transform_matrix 007.png finite Give"),
     "last row": (lambda c: pose(c, 3, 0, 0.1), "transform_matrix 007.png last row"),

@@ -106,3 +106,36 @@ def test_empty_masks_are_named(tmp_path, printed):
         Image.new("L", (12, 9)).save(path)
     with pytest.raises(InputError, match="leave nothing of 000.png, 001.png, 002.png and 6 more"):
         datamanager(capture).load_all_images()
+
+
+@pytest.mark.parametrize("k1", [0.0, 0.05])
+def test_a_fisheye_is_undistorted(tmp_path, k1):
+    """What is in memory is what a pinhole sees of a world whose colour depends on direction."""
+    side, focal = 96, 60.0
+
+    def seen(x, y):  # smooth in the direction (x, y, 1)
+        return np.stack([128 + 100 * np.sin(3 * x), 128 + 100 * np.cos(2 * y + x), 0 * x + 50], axis=-1)
+
+    capture = Capture(tmp_path / "scene", images=3)
+    capture.meta |= {"w": side, "h": side, "cx": side / 2, "cy": side / 2, "fl_x": focal, "fl_y": focal}
+    capture.meta |= {"camera_model": "OPENCV_FISHEYE", "k1": k1}
+    u, v = np.meshgrid(np.arange(side) + 0.5, np.arange(side) + 0.5)
+    x, y = (u - side / 2) / focal, (v - side / 2) / focal
+    distance = np.hypot(x, y)
+    angle = distance.copy()
+    for _ in range(20):  # distance = angle (1 + k1 angle^2)
+        angle = distance / (1 + k1 * angle**2)
+    stretch = np.tan(angle) / distance
+    picture = Image.fromarray(seen(x * stretch, y * stretch).round().astype(np.uint8))
+    for frame in capture.meta["frames"]:
+        picture.save(capture.folder / frame["file_path"])
+    manager = datamanager(capture)
+    manager.load_all_images()
+    for images, set in ((manager.cached_train, manager.train_dataset), (manager.cached_eval, manager.eval_dataset)):
+        image, camera = images[0]["image"].numpy().astype(float), set.cameras[0]
+        u, v = np.meshgrid(np.arange(image.shape[1]) + 0.5, np.arange(image.shape[0]) + 0.5)
+        x, y = (u - camera.cx.item()) / camera.fx.item(), (v - camera.cy.item()) / camera.fy.item()
+        # Interpolating between pixels 1/60 apart, second derivative 900: below 0.1. Rounding twice: 1.
+        assert np.abs(image - seen(x, y))[2:-2, 2:-2].max() < 2.5
+        assert np.abs(image - seen(*((np.stack([u, v]) - side / 2) / focal)))[2:-2, 2:-2].max() > 10
+        assert camera.camera_type.item() == 1
