@@ -38,7 +38,7 @@ def today(scene: str, name: str, strategy: str = OWN) -> Trainings:
 
 
 def twins(trial: str, base: str) -> list[list[dict]]:
-    """Pairs of records of a trial with a twin and of one without, of the same seed, on the same held-out views."""
+    """Pairs of records of two trials of results/twin.json, of the same seed, on the same held-out views."""
     rows = {place: row.records for place, row in bench_rows("twin").items()}
     pairs = [(row, rows.get((*place[:2], base), {})) for place, row in rows.items() if place[2] == trial]
     return [[one[seed], other[seed]] for one, other in pairs for seed in one if seed in other]
@@ -63,6 +63,16 @@ def twin_tests(kind: str) -> str:
         better = sum(one["psnr"] > other["psnr"] for one, other in zip(*both, strict=True))
         cells.append(f"`{scene}` {signed(psnr, 2)} dB, {signed(ssim, 4)} SSIM ({better}/{len(both[0])})")
     return "; ".join(cells)
+
+
+def cleared() -> str:
+    """Changes on held-out views if splats before views between the cameras are removed."""
+    cells = []
+    for scene in ("kitchen", "castle"):
+        pairs = [pair for pair in twins("alone__0.7_cleared", "alone") if pair[0]["cell"]["scene"].endswith(scene)]
+        psnr = [one["measured"]["test"]["psnr"] - other["measured"]["test"]["psnr"] for one, other in pairs]
+        cells.append(f"`{scene}` {signed(fmean(psnr), 2)} dB")
+    return ", ".join(cells)
 
 
 def twin_cost(of: str) -> str:
@@ -195,6 +205,7 @@ BLOCKS = {
     "captures.twin_tests": twin_tests,
     "captures.twin_cost": twin_cost,
     "captures.floaters": floaters,
+    "captures.cleared": cleared,
     "captures.today": lambda *place: _run({of: mean(today(*place), of) for of in ("psnr", "ssim", "splats")}),
     "captures.sparse": sparse,
     "captures.by_views": lambda: verdicts({f"{views} views": sparse_runs(scene) for scene, views in HALF.items()}),

@@ -2,7 +2,6 @@
 """Nerfstudio's trainer with whole checkpoints, a guard against numbers that are not finite, a time budget, a mean over
 the last steps, and an orderly end whatever its cause."""
 
-import os
 import gc
 import sys
 from collections.abc import Iterator
@@ -224,11 +223,6 @@ class NrfgsTrainer(Trainer):
             is_logged = step % self.config.logging.steps_per_log == 0
             loss, losses, metrics = descend(self, step, pulled, is_logged)
             optimizers.scheduler_step_all(step)
-        if os.environ.get("NRFGS_CARVE"):
-            if getattr(self, "_empty", None) is None:
-                from nrfgs_ns.training.empty_space import EmptySpace
-                self._empty = EmptySpace(self.pipeline.datamanager.train_dataset.cameras, model.seed_points[0], model._seed)
-            self._empty.clear([t.pipeline.model for t in self._trainings], step)
         self._completed_step = step
         if pace is not None:
             model.schedule_at(int(pace.position))

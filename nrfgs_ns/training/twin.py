@@ -67,13 +67,12 @@ class Between:
         self.neighbours = distances.topk(count, largest=False).indices.tolist()
         self._turn = functools.cache(lambda *pair: Slerp([0, 1], Rotation.from_matrix(self.poses[[*pair], :, :3])))
 
-    def draw(self, random: Random, width: float | None = None) -> Cameras:
+    def draw(self, random: Random) -> Cameras:
         """A view between a camera and one of its neighbours, with the first one's lens. [1], in host memory."""
         index = random.randrange(len(self.views))
         other = random.choice(self.neighbours[index])
         share = random.random()
-        width = JITTER if width is None else width
-        jitter = [random.gauss(0.0, width * self.spacing) for _ in range(3)]
+        jitter = [random.gauss(0.0, JITTER * self.spacing) for _ in range(3)]
         center = (1 - share) * self.poses[index, :, 3] + share * self.poses[other, :, 3] + jitter
         view = copy(self.views[index])
         pose = np.column_stack([self._turn(index, other)(share).as_matrix(), center])
