@@ -143,7 +143,7 @@ class ErrorGuidedDensification(Densification):
             grown = draw(weights.index_fill(0, parents, 0.0), wanted)
         split(splats, optimizers, torch.cat([parents, grown]), places)
         made_from = torch.cat([torch.arange(count, device=dead.device).index_copy(0, places, parents), grown])
-        self.take_rows(made_from, count)
+        self.take_rows(made_from)
         self._decay_opacities(step, splats["opacities"])
         if self.verbose:
             print(f"Step {step}: {len(places)} GSs replaced, {len(grown)} split. Now having {count + len(grown)} GSs.")

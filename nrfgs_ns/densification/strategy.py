@@ -67,15 +67,6 @@ def shown_opacity(stored: Tensor, change: Tensor) -> Tensor:
     return torch.where(change < 0, stored * (1 + change), stored + change).clamp_max(1.0)
 
 
-def per_splat_state(state: Mapping[str, Any], count: int) -> dict[str, Tensor]:
-    """The entries of a state that have a row for each of `count` splats."""
-    return {
-        name: value
-        for name, value in state.items()
-        if isinstance(value, Tensor) and value.dim() > 0 and len(value) == count
-    }
-
-
 @dataclass
 class DensificationConfig(ABC):
     """Options of a strategy; each has a `budget`, too, the number of splats to grow to (0: as many as the rules give).
@@ -222,9 +213,9 @@ class Densification(ABC):
             if name in self.state and self.state[name] is None:
                 self.state[name] = torch.full((count,), UNSEEN if name == CHANGE else 0.0, device=device)
 
-    def take_rows(self, rows: Tensor, count: int) -> None:
-        """Let the statistics, which have `count` rows, become their rows `rows`, int64 [any number], in this order."""
-        self.state.update({name: value[rows] for name, value in per_splat_state(self.state, count).items()})
+    def take_rows(self, rows: Tensor) -> None:
+        """Let the statistics become their rows `rows`, int64 [any number], in this order."""
+        self.state.update({name: value[rows] for name, value in self.state.items() if isinstance(value, Tensor)})
 
     def take_changes(self, info: Mapping[str, Any], count: int) -> None:
         """Let the window's changes of opacity be at least those of a step."""

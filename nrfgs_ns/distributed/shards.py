@@ -14,7 +14,6 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
-from nrfgs_ns.densification.strategy import per_splat_state
 from nrfgs_ns.distributed import comm
 
 
@@ -33,8 +32,7 @@ def map_model_rows(state: Mapping[str, Any], change: Callable[[Tensor], Any], pr
     """A model's state, named after `prefix`, with each table of splats and of densification's statistics changed."""
     rows = f"{prefix}gauss_params."
     extra = state[f"{prefix}_extra_state"]
-    statistics = per_splat_state(extra["strategy"], len(state[f"{rows}means"]))
-    strategy = {**extra["strategy"], **{name: change(value) for name, value in statistics.items()}}
+    strategy = {name: change(v) if isinstance(v, Tensor) else v for name, v in extra["strategy"].items()}
     changed = {name: change(value) if name.startswith(rows) else value for name, value in state.items()}
     return {**changed, f"{prefix}_extra_state": {**extra, "strategy": strategy}}
 
@@ -87,7 +85,7 @@ def rebalance(
     def moved(rows: Tensor) -> Tensor:
         return torch.cat([rows.index_select(0, staying), comm.swap(rows.index_select(0, going), sent, received)])
 
-    statistics = per_splat_state(state, count)
+    statistics = {name: value for name, value in state.items() if isinstance(value, Tensor)}
     for name in sorted(splats):  # in the same order on all devices
         _update_param_with_optimizer(
             lambda _, old: Parameter(moved(old.detach())), lambda _, old: moved(old), splats, optimizers, names=[name]
