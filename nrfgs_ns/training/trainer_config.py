@@ -21,7 +21,7 @@ from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.config_file import check_types
-from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS, Pace, TimedPace, resolution_phases, steps_for
+from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS, Pace, TimedPace, steps_for
 
 AVERAGED = 200
 """Steps to average in the presets and where the steps are chosen by the views."""
@@ -128,8 +128,8 @@ class NrfgsTrainerConfig(TrainerConfig):
         length = self.schedule_steps or self.max_num_iterations
         if self.time_budget is not None:
             model = self.pipeline.model
-            phases = resolution_phases(model.num_downscales, model.resolution_schedule)
-            return TimedPace(length, 60.0 * self.time_budget, phases)
+            doublings = [model.resolution_schedule * n for n in range(1, model.num_downscales + 1)]
+            return TimedPace(length, 60.0 * self.time_budget, doublings)
         return None if self.schedule_steps is None else Pace(length, length / self.max_num_iterations)
 
     def print_to_terminal(self) -> None:
