@@ -9,7 +9,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, MutableMapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -105,6 +105,7 @@ class DensificationConfig(ABC):
             value = getattr(self, field.name)
             if isinstance(value, (int, float)):
                 self.require(0 <= value < math.inf, field.name, "zero or positive")
+        self.require(self.opacity_seen in get_args(OpacitySeen), "opacity_seen", "base or peak")
         self.require(self.refine_every >= 1, "refine_every", "at least 1")
 
     def require(self, holds: bool, name: str, needed: str) -> None:
