@@ -12,6 +12,6 @@ With W devices, a step is the step of one process on the mean of the losses of W
    (`trainer.py`).
 
 Densification, pruning, resets and Adam are those of one device, on the shard alone. `shards.py` cuts tables of splats
-up, moves rows when shards drift apart, and puts them together for checkpoints, which are those of one device. Messages
-(`comm.py`) go by NCCL on GPUs and gloo on CPUs.
+up, and puts them together for checkpoints, which are those of one device. Messages (`comm.py`) go by NCCL on GPUs and
+gloo on CPUs.
 """

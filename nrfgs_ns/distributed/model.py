@@ -13,13 +13,12 @@ from nrfgs_ns.appearance.head import ViewNoise
 from nrfgs_ns.densification import Densification
 from nrfgs_ns.distributed import comm
 from nrfgs_ns.distributed.exchange import send_to_cameras
-from nrfgs_ns.distributed.shards import map_model_rows, own_rows, rebalance, shard_counts
+from nrfgs_ns.distributed.shards import map_model_rows, own_rows, shard_counts
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.photograph import PhotographModel
 from nrfgs_ns.model.loss import shrinkage
 from nrfgs_ns.model.model import NrfgsModel
 from nrfgs_ns.rasterizer import Pinhole, Projection, View, project, project_view
-from nrfgs_ns.training.pipeline import ShardingConfig
 
 ROWS = "camera_ids", "gaussian_ids", "radii", "means2d", "depths", "n_cameras"
 """Columns of a projection that densification reads in `info`."""
@@ -37,7 +36,6 @@ class ShardedModel(NrfgsModel):
     """every device's splats, [W]"""
 
     def populate_modules(self):
-        self.sharding: ShardingConfig = self.kwargs["sharding"]
         super().populate_modules()
         if self.trimming is not None:
             raise InputError("pipeline.model.robust_loss is for one device. Leave it out.")
@@ -135,8 +133,6 @@ class ShardedModel(NrfgsModel):
         self.densification.post_backward(step, self._screen_info(), self.gauss_params, self.optimizers)
         if step % self.config.densification.refine_every == 0:
             self.count()
-            if max(self.counts) > self.sharding.rebalance_at * sum(self.counts) / len(self.counts):
-                self.counts = rebalance(self.gauss_params, self.optimizers, self.densification.state, self.counts)
 
     def count(self) -> None:
         """Update `counts` from all devices."""

@@ -5,7 +5,6 @@ main one writes checkpoints of the whole."""
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -40,7 +39,7 @@ class ShardedPipeline(NrfgsPipeline):
     model: ShardedModel
 
     def __init__(self, config: NrfgsPipelineConfig, device: str, test_mode: str = "val", world_size: int = 1, **kwargs):
-        config = replace(config, model=replace(config.model, _target=partial(ShardedModel, sharding=config.sharding)))
+        config = replace(config, model=replace(config.model, _target=ShardedModel))
         super().__init__(config, device, test_mode, world_size=1, **kwargs)
         self.world_size = world_size
         torch.manual_seed(torch.initial_seed() + 1 + comm.rank())

@@ -47,10 +47,7 @@ SHOWN = ("psnr", "cc_psnr", "ssim", "cc_ssim", "ms_ssim", "lpips", "l1", "second
 
 @dataclass
 class ShardingConfig:
-    """How the splats are spread over several devices."""
-
-    rebalance_at: float = 1.1
-    """splats move between devices when one has more than this many times the mean"""
+    """No options: a config.yml of version 0.2.0 names this class."""
 
 
 @dataclass
@@ -62,8 +59,6 @@ class NrfgsPipelineConfig(VanillaPipelineConfig):
     """specifies the datamanager config"""
     model: NrfgsModelConfig = field(default_factory=NrfgsModelConfig)
     """specifies the model config"""
-    sharding: ShardingConfig = field(default_factory=ShardingConfig)
-    """with several devices: how the splats are spread over them"""
     compact: Path | None = None
     """read the model from a file of `nrfgs export compact` instead of the checkpoint; not for training"""
 
