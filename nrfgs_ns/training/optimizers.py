@@ -32,8 +32,8 @@ class LeanOptimizers(Optimizers):
         super().__init__(config, param_groups)
         self.steps_per_log = steps_per_log
         self.pace = pace
-        self._tables: dict[torch.device, Any] = {}
-        """not shared with a twin's, since the host waits for the copy of the last step's"""
+        self._table: Any = None
+        """the kernel's `AdamTable`, not shared with a twin's, since the host waits for the copy of the last step's"""
         for optimizer in self.optimizers.values():
             if isinstance(optimizer, Adam) and all(parameter.is_cuda for parameter in parameters_of(optimizer)):
                 for group in optimizer.param_groups:
@@ -52,7 +52,7 @@ class LeanOptimizers(Optimizers):
     def step(self) -> None:
         """One step of all optimisers."""
         plain = [optimizer for name, optimizer in self.optimizers.items() if self._is_plain(name)]
-        stepped = plain if step_at_once(plain, self._tables) else []
+        stepped = plain if self.step_at_once(plain) else []
         for name, optimizer in self.optimizers.items():
             if optimizer not in stepped:
                 if (max_norm := self.config[name]["optimizer"].max_norm) is not None:
@@ -68,6 +68,29 @@ class LeanOptimizers(Optimizers):
             and self.config[name]["optimizer"].max_norm is None
             and all(optimizer.state.get(p) for p in parameters_of(optimizer) if p.grad is not None)
         )
+
+    def step_at_once(self, optimizers: Sequence[Adam]) -> bool:
+        """Make one step of fused Adams that have state by one Triton kernel, if it runs; returns whether it did. As in
+        torch, the step changes nothing where `found_inf`, a tensor that they share, is 1."""
+        work = [
+            (group, parameter, optimizer.state[parameter])
+            for optimizer in optimizers
+            for group in optimizer.param_groups
+            for parameter in group["params"]
+            if parameter.grad is not None
+        ]
+        if not work or (device := work[0][1].device).type != "cuda" or not try_kernel(device):
+            return False
+        from nrfgs_ns.training.adam_triton import AdamTable
+
+        self._table = self._table or AdamTable(device)
+        counters = [state["step"] for _, _, state in work]
+        with torch.no_grad():
+            torch._foreach_add_(counters, 1)
+            done = self._table.step(work, getattr(optimizers[0], "found_inf", None))
+            if not done:
+                torch._foreach_sub_(counters, 1)
+        return done
 
     def scheduler_step_all(self, step: int) -> None:
         if self.pace is not None:
@@ -99,34 +122,6 @@ class LeanOptimizers(Optimizers):
             parts = self.optimizers[name].param_groups, scheduler.base_lrs, scheduler.lr_lambdas
             for group, base, factor in zip(*parts, strict=True):
                 group["lr"] = base * factor(scheduler.last_epoch)
-
-
-def step_at_once(optimizers: Sequence[Adam], tables: dict[torch.device, Any]) -> bool:
-    """Make one step of several fused Adams that have state by one Triton kernel, if it runs; returns whether it did. As
-    in torch, the step changes nothing where the optimisers' `found_inf`, a tensor on the device, is 1. `tables` keeps
-    the device's `AdamTable`."""
-    work = [
-        (group, parameter, optimizer.state[parameter])
-        for optimizer in optimizers
-        for group in optimizer.param_groups
-        for parameter in group["params"]
-        if parameter.grad is not None
-    ]
-    device = work[0][1].device if work else torch.device("cpu")
-    skips = [getattr(optimizer, "found_inf", None) for optimizer in optimizers]
-    if device.type != "cuda" or any(skip is not skips[0] for skip in skips) or not try_kernel(device):
-        return False
-    from nrfgs_ns.training.adam_triton import AdamTable
-
-    counters = [state["step"] for _, _, state in work]
-    with torch.no_grad():
-        torch._foreach_add_(counters, 1)
-        if device not in tables:
-            tables[device] = AdamTable(device)
-        done = tables[device].step(work, skips[0])
-        if not done:
-            torch._foreach_sub_(counters, 1)
-    return done
 
 
 @tried_once("Adam")
