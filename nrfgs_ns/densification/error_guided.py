@@ -30,7 +30,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from nrfgs_ns.densification.statistics import Statistics, accumulate
-from nrfgs_ns.densification.strategy import CHANGE, Densification, DensificationConfig, OpacitySeen, Optimizers, Splats
+from nrfgs_ns.densification.strategy import Densification, DensificationConfig, OpacitySeen, Optimizers, Splats
 
 ERROR = "error"
 """Name in `state`: the largest error of each splat in a view of this window, [N]."""
@@ -117,11 +117,11 @@ class ErrorGuidedDensification(Densification):
 
     def _update_statistics(self, step: int, info: Mapping[str, Any], count: int) -> None:
         """Let the window's maxima be at least the step's; errors only while splats grow."""
-        self.make_tables((ERROR, WIDTH, CHANGE), count, info["radii"].device)
+        self.take_changes(info, count)
+        self.make_tables((ERROR, WIDTH), count, info["radii"].device)
         grows = step < self.grow_until
         norms, gradients = (self.state[ERROR], info["means2d"].absgrad) if grows else (None, None)
-        tables = Statistics(self.state[WIDTH], norms, changes=self.state.get(CHANGE))
-        accumulate(tables, info, 1.0, gradients, info.get("change"))
+        accumulate(Statistics(self.state[WIDTH], norms), info, 1.0, gradients)
 
     # What a refinement does.
 

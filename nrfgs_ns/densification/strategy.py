@@ -196,7 +196,8 @@ class Densification(ABC):
             # Rows first, then the sigmoid, as heads do: in the other order the last bit may differ.
             stored = torch.sigmoid(logits.detach().index_select(0, info["gaussian_ids"])).squeeze(-1)
             changes = change_of(stored, opacities.detach().to(stored.dtype))
-            info["change"] = torch.where(info["radii"] > 0, changes, UNSEEN)
+            # A NaN is the guard's to find; it must not stay in a statistic.
+            info["change"] = torch.where(info["radii"] > 0, changes, UNSEEN).nan_to_num(UNSEEN)
 
     @torch.no_grad()
     def post_backward(self, step: int, info: Mapping[str, Any], splats: Splats, optimizers: Optimizers) -> None:
