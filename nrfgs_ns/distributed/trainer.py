@@ -3,7 +3,7 @@
 main one writes checkpoints of the whole."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -14,6 +14,7 @@ from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import comms
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
+from torch.nn import Parameter
 from torch.optim import Optimizer
 
 from nrfgs_ns.distributed import comm
@@ -133,12 +134,12 @@ class ShardedOptimizers(LeanOptimizers):
         comm.sum_over_devices([gradient for gradient in gradients if gradient is not None])
         super().step()
 
-    def load_optimizers(self, loaded_state: dict[str, Any]) -> None:
+    def load_optimizers(self, loaded_state: dict[str, Any], weights: Sequence[Parameter] = ()) -> None:
         """Load this device's rows of a whole checkpoint."""
         own = dict(loaded_state)
         for name in self.model.gauss_params:
             own[name] = map_moments(own[name], own_rows)
-        super().load_optimizers(own)
+        super().load_optimizers(own, weights)
 
 
 class ShardedTrainer(NrfgsTrainer):

@@ -102,14 +102,11 @@ class LeanOptimizers(Optimizers):
             if step % self.steps_per_log == 0:
                 writer.put_scalar(name=f"learning_rate/{name}", scalar=scheduler.get_last_lr()[0], step=step)
 
-    def replace_parameters(self, name: str, parameters: list[Parameter]) -> None:
-        """Replace a group's parameters, at its learning rate and schedule."""
-        optimizer = self.optimizers[name]
-        optimizer.param_groups[0]["params"] = self.parameters[name] = parameters
-        optimizer.state.clear()
-
-    def load_optimizers(self, loaded_state) -> None:
-        """Load the moments; options such as learning rates, or whether Adam is fused, stay this training's."""
+    def load_optimizers(self, loaded_state, weights: Sequence[Parameter] = ()) -> None:
+        """Load the moments; options such as learning rates, or whether Adam is fused, stay this training's. `weights`
+        are the head's, which is another one than was built if the checkpoint's is smaller."""
+        if weights:
+            self.optimizers["field"].param_groups[0]["params"] = self.parameters["field"] = list(weights)
         for name, state in loaded_state.items():
             optimizer = self.optimizers[name]
             optimizer.load_state_dict({**state, "param_groups": optimizer.state_dict()["param_groups"]})
@@ -119,9 +116,8 @@ class LeanOptimizers(Optimizers):
         for name, state in loaded_state.items():
             scheduler = self.schedulers[name]
             scheduler.load_state_dict({**state, "base_lrs": scheduler.base_lrs})
-            parts = self.optimizers[name].param_groups, scheduler.base_lrs, scheduler.lr_lambdas
-            for group, base, factor in zip(*parts, strict=True):
-                group["lr"] = base * factor(scheduler.last_epoch)
+            (group,), (factor,) = self.optimizers[name].param_groups, scheduler.lr_lambdas
+            group["lr"] = scheduler.base_lrs[0] * factor(scheduler.last_epoch)
 
 
 @tried_once("Adam")

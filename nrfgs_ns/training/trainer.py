@@ -143,9 +143,7 @@ class NrfgsTrainer(Trainer):
             schedules = "" if config.schedule_steps is None else f" --schedule-steps {config.schedule_steps}"
             longer = f"--max-num-iterations {2 * self._start_step}{schedules} makes as many more"
             raise InputError(f"{path} is the end of a training of {self._start_step:,} steps: {longer}.")
-        if weights := list(self.pipeline.model.head.parameters()):  # of a smaller head, perhaps, than was built
-            self.optimizers.replace_parameters("field", weights)
-        self.optimizers.load_optimizers(content["optimizers"])
+        self.optimizers.load_optimizers(content["optimizers"], list(self.pipeline.model.head.parameters()))
         if config.load_scheduler:
             self.optimizers.load_schedulers(content["schedulers"])
         resume(self.pace, training.get("pace"), self._start_step, left, self.world_size)
