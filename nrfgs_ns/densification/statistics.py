@@ -25,19 +25,6 @@ class Statistics(NamedTuple):
     """number of steps that have shown the splat"""
 
 
-class Step(NamedTuple):
-    """The M splats of a step."""
-
-    rows: Tensor
-    """rows of the tables, int64 [M]"""
-    radii: Tensor
-    """radii in pixels, [M]; rows of radius 0 do not count"""
-    side: float
-    """the image's longer side in pixels, by which radii are divided"""
-    scales: tuple[float, float]
-    """factors in x and y of the gradients, which come by a centre's position in pixels"""
-
-
 def accumulate(tables: Statistics, info: Mapping[str, Any], extent: float, gradients: Tensor | None) -> None:
     """Update the tables, in place, by a step. Norms that are not finite count as 0.
 
@@ -47,9 +34,8 @@ def accumulate(tables: Statistics, info: Mapping[str, Any], extent: float, gradi
         extent: width and height of the image in the units by which gradients are to be taken.
         gradients: the loss's gradients by the rows' centres in pixels, [M, 2].
     """
-    width, height, cameras = info["width"], info["height"], info["n_cameras"]
-    scales = width / extent * cameras, height / extent * cameras
-    step = Step(info["gaussian_ids"], info["radii"], float(max(width, height)), scales)
+    cameras = info["n_cameras"]
+    scales = info["width"] / extent * cameras, info["height"] / extent * cameras
     tensors = [value for value in (*tables, gradients) if value is not None]
     update = in_torch
     if (
@@ -59,15 +45,17 @@ def accumulate(tables: Statistics, info: Mapping[str, Any], extent: float, gradi
         and try_kernel(tensors[0].device)
     ):
         from nrfgs_ns.densification.statistics_triton import in_triton as update
-    update(tables, step, gradients)
+    update(tables, info, scales, gradients)
 
 
-def in_torch(tables: Statistics, step: Step, gradients: Tensor | None) -> None:
-    """`accumulate` in PyTorch, the kernel's twin."""
-    (widths, norms, counts), (rows, radii, side, scales) = tables, step
+def in_torch(
+    tables: Statistics, info: Mapping[str, Any], scales: tuple[float, float], gradients: Tensor | None
+) -> None:
+    """`accumulate` in PyTorch, the kernel's twin; `scales` are factors in x and y of the gradients."""
+    (widths, norms, counts), rows, radii = tables, info["gaussian_ids"], info["radii"]
     seen = radii > 0
     if widths is not None:
-        widths.scatter_reduce_(0, rows, radii / side, "amax")
+        widths.scatter_reduce_(0, rows, radii / float(max(info["width"], info["height"])), "amax")
     if norms is not None:
         x, y = gradients.unbind(dim=-1)
         norm = torch.hypot(x * scales[0], y * scales[1]).nan_to_num(0.0, 0.0) * seen
@@ -82,6 +70,7 @@ def try_kernel(device: torch.device) -> None:
     from nrfgs_ns.densification.statistics_triton import in_triton
 
     one, gradient = torch.ones(1, device=device), torch.ones(1, 2, device=device)
-    step = Step(torch.zeros(1, dtype=torch.int64, device=device), one.int(), 1.0, (1.0, 1.0))
+    info = {"gaussian_ids": torch.zeros(1, dtype=torch.int64, device=device), "radii": one.int()}
+    info |= {"width": 1, "height": 1}
     for norms, counts in ((one.clone(), one.clone()), (one.clone(), None), (None, None)):  # after growth no norms
-        in_triton(Statistics(one, norms, counts), step, gradient)
+        in_triton(Statistics(one, norms, counts), info, (1.0, 1.0), gradient)

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """`statistics.in_torch` as a Triton kernel."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
-from nrfgs_ns.densification.statistics import Statistics, Step
+from nrfgs_ns.densification.statistics import Statistics
 from nrfgs_ns.kernels.launch import Launcher
 
 BLOCK = 256
@@ -43,15 +46,18 @@ def statistics_kernel(
 launch = Launcher(statistics_kernel)
 
 
-def in_triton(tables: Statistics, step: Step, gradients: Tensor | None) -> None:
+def in_triton(
+    tables: Statistics, info: Mapping[str, Any], scales: tuple[float, float], gradients: Tensor | None
+) -> None:
     """`statistics.in_torch` for dense float32 tensors and rows that are all different."""
-    count = len(step.rows)
+    count = len(info["gaussian_ids"])
     written = [table for table in tables if table is not None]
     if count > 0:
-        arguments = *tables, step.rows, step.radii.contiguous(), gradients
+        arguments = *tables, info["gaussian_ids"], info["radii"].contiguous(), gradients
         arguments = (written[0] if value is None else value for value in arguments)  # a pointer that is not used
         wanted = {name.upper(): table is not None for name, table in tables._asdict().items()}
         grid = -(-count // BLOCK), 1, 1
-        launch(grid, *arguments, count, *step.scales, 1 / step.side, BLOCK=BLOCK, **wanted, num_warps=4)
+        radius_scale = 1 / float(max(info["width"], info["height"]))
+        launch(grid, *arguments, count, *scales, radius_scale, BLOCK=BLOCK, **wanted, num_warps=4)
         for table in written:
             torch.autograd.graph.increment_version(table)

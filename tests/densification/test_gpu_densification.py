@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 from nrfgs_ns.densification import statistics
 from nrfgs_ns.densification.mcmc import add_noise, split_evenly
-from nrfgs_ns.densification.statistics import Statistics, Step
+from nrfgs_ns.densification.statistics import Statistics
 
 pytestmark = pytest.mark.gpu
 
@@ -65,7 +65,7 @@ def test_one_camera_is_the_kernels(monkeypatch, counts):
     tables = Statistics(*torch.zeros(3 if counts else 2, 5000, device="cuda"))
     gradients = torch.randn(3000, 2, device="cuda")
     twin = Statistics(*(None if value is None else value.clone() for value in tables))
-    statistics.in_torch(twin, Step(rows, radii, 640.0, (640.0, 480.0)), gradients)
+    statistics.in_torch(twin, info, (640.0, 480.0), gradients)
     monkeypatch.setattr(statistics, "in_torch", None)
     statistics.accumulate(tables, info, 1.0, gradients)
     for value, other in zip(filter(torch.is_tensor, tables), filter(torch.is_tensor, twin), strict=True):

@@ -15,7 +15,7 @@ from test_against_twin import scenes
 from tile_list_cases import Splats, assert_lists, splats
 from torch.testing import assert_close
 
-from nrfgs_ns.densification.statistics import Statistics, Step, in_torch
+from nrfgs_ns.densification.statistics import Statistics, in_torch
 from nrfgs_ns.densification.statistics_triton import in_triton
 from nrfgs_ns.image import ssim_triton
 from nrfgs_ns.image.ssim import photometric_loss
@@ -57,7 +57,8 @@ def test_the_kernel_remembers_what_its_twin_remembers(wanted, visible):
     tables = torch.rand(400) / 50, torch.rand(400) * 300, torch.rand(400) - 1.0
     mine = Statistics(*(table if want else None for table, want in zip(tables, wanted, strict=True)))
     theirs = Statistics(*(None if value is None else value.clone() for value in mine))
-    shown = Step(rows, radii, 400.0, (400.0, 300.0)), gradients
+    info = {"gaussian_ids": rows, "radii": radii, "width": 400, "height": 300}
+    shown = info, (400.0, 300.0), gradients
     in_triton(mine, *shown)
     in_torch(theirs, *shown)
     for value, twin in zip(mine, theirs, strict=True):
