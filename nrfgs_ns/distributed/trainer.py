@@ -61,8 +61,6 @@ class ShardedMean(ParameterMean):
     """`ParameterMean` of one device's splats and of the shared weights. If one device must restart, all do, so that
     shared weights stay the same. A training that goes on averages its own steps."""
 
-    is_saved = False
-
     def is_current(self, optimizers: Mapping[str, Optimizer]) -> bool:
         """Whether the rows of all devices still denote the splats that were averaged. The host waits for the answer."""
         return all(comm.gather(super().is_current(optimizers)))

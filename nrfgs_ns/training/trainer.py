@@ -151,7 +151,7 @@ class NrfgsTrainer(Trainer):
             self.config = replace(self.config, max_num_iterations=left)
         if self.pace is not None:
             self.pipeline.model.schedule_at(int(self.pace.position))
-        if self.mean is not None and self.mean.is_saved and training.get("parameter_mean") is not None:
+        if self.mean is not None and self.world_size == 1 and "parameter_mean" in training:
             self.mean.load_state(training["parameter_mean"], self.optimizers.optimizers)
         if self.twin is not None and "twin" not in training:
             warn("The checkpoint is of a training without a twin, which goes on without one.")
@@ -382,7 +382,7 @@ class NrfgsTrainer(Trainer):
         training: dict[str, Any] = {"options": options_of(self.config)}
         if self.pace is not None:
             training["pace"] = self.pace.state()
-        if self.mean is not None and self.mean.is_saved and self.mean.count > 0:
+        if self.mean is not None and self.world_size == 1 and self.mean.count > 0:
             training["parameter_mean"] = self.mean.state()
         if self.twin is not None:
             training["twin"] = self.twin.state()
