@@ -66,11 +66,6 @@ class ShardedModel(NrfgsModel):
     def num_splats(self) -> int:
         return sum(self.counts)
 
-    @property
-    def parameter_bytes(self) -> int:
-        row = sum(value.shape[1:].numel() * value.element_size() for value in self.gauss_params.values())
-        return row * self.num_splats + sum(weight.nbytes for weight in self.head.parameters())
-
     # Rendering.
 
     def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:
