@@ -14,7 +14,6 @@ from nrfgs_ns.densification import Densification
 from nrfgs_ns.distributed import comm
 from nrfgs_ns.distributed.exchange import send_to_cameras
 from nrfgs_ns.distributed.shards import map_model_rows, own_rows, shard_counts
-from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.photograph import PhotographModel
 from nrfgs_ns.model.loss import shrinkage
 from nrfgs_ns.model.model import NrfgsModel
@@ -37,8 +36,6 @@ class ShardedModel(NrfgsModel):
 
     def populate_modules(self):
         super().populate_modules()
-        if self.trimming is not None:
-            raise InputError("pipeline.model.robust_loss is for one device. Leave it out.")
         self.view_noise = ViewNoise(0.0, self.view_noise.seed + comm.rank())  # each device has other splats
 
     def _strategy(self) -> Densification:

@@ -98,11 +98,13 @@ class NrfgsTrainerConfig(TrainerConfig):
                 raise InputError(f"{name} is {value}; it must be {least}, and below 2^32.")
         if devices == 1 and self.machine.device_type == "cuda" and not torch.cuda.is_available():
             raise InputError("machine.device_type is cuda, but PyTorch finds no GPU (`nrfgs doctor`). Give cpu.")
-        has_twin = self.pipeline.model.twin == "on"
-        if devices > 1 and (has_twin or (self.time_budget or self.schedule_steps) is not None):
-            raise InputError("time_budget, schedule_steps and pipeline.model.twin are for one device. Leave them out.")
         check_types(self.pipeline, "config.yml", "pipeline.")
-        self.pipeline.model.check()
+        model = self.pipeline.model
+        model.check()
+        is_of_one = model.twin == "on" or model.robust_loss > 0 or (self.time_budget or self.schedule_steps) is not None
+        if devices > 1 and is_of_one:
+            names = "time_budget, schedule_steps, pipeline.model.twin and pipeline.model.robust_loss"
+            raise InputError(f"{names} are for one device. Leave them out.")
         if self.load_step is not None and self.load_dir is None:
             raise InputError(f"load_step is {self.load_step}, but there is no --load-dir. Give the folder, too.")
         if None not in (self.load_dir, self.load_checkpoint):
