@@ -56,9 +56,6 @@ class Pace:
         self.position = 0.0
         """0 at the first step, at most L"""
 
-    def start(self) -> None:
-        """Training begins, or goes on, now."""
-
     def advance(self) -> None:
         """Move on to the next step's position."""
         self.position = min(self.position + self.rate, float(self.length))
@@ -127,6 +124,7 @@ class TimedPace(Pace):
         return math.ceil((self.length - self.position) / self.rate)
 
     def start(self) -> None:
+        """Training begins, or goes on, now."""
         self._training_began = self._advanced = self.clock()
 
     def advance(self) -> None:

@@ -181,11 +181,10 @@ class NrfgsTrainer(Trainer):
         self._check_parameters(self._start_step)
         if isinstance(self.pace, TimedPace):  # the clock says which step is the last
             self.config = replace(self.config, max_num_iterations=sys.maxsize // 2)
+            self.pace.start()
         gc.collect()
         gc.freeze()  # all present objects stay: the collector need not visit them
         try:
-            if self.pace is not None:
-                self.pace.start()
             with heard_signals(self.request), self._state_on_disk_if_it_fails():
                 super().train()
         finally:
