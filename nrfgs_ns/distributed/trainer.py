@@ -3,7 +3,7 @@
 main one writes checkpoints of the whole."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -18,8 +18,7 @@ from torch.nn import Parameter
 from torch.optim import Optimizer
 
 from nrfgs_ns.distributed import comm
-from nrfgs_ns.distributed.model import ShardedModel
-from nrfgs_ns.distributed.shards import map_model_rows, map_moments, own_rows
+from nrfgs_ns.distributed.model import ShardedModel, map_model_rows, own_rows
 from nrfgs_ns.training.averaging import ParameterMean
 from nrfgs_ns.training.guard import MAX_GRADIENT, Guard, TrainingStopped, Verdict, Watched
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
@@ -117,6 +116,15 @@ class ShardedGuard(Guard):
         device, message, step, origin, _ = next((stop for stop in own if stop[3] == "rendering"), own[0])
         savable = all(stop[4] for stop in stops)
         return TrainingStopped(f"On device {device} of {comm.world()}: {message}", step, origin, savable)
+
+
+def map_moments(state: Mapping[str, Any], change: Callable[[Tensor], Any]) -> dict[str, Any]:
+    """The state of one of the splats' optimisers with its moments changed; Adam's step counter, a scalar, stays."""
+    moments = {
+        index: {key: change(v) if isinstance(v, Tensor) and v.dim() > 0 else v for key, v in entry.items()}
+        for index, entry in state["state"].items()
+    }
+    return {**state, "state": moments}
 
 
 class ShardedOptimizers(LeanOptimizers):
