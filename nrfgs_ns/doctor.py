@@ -2,7 +2,6 @@
 """`nrfgs doctor`: what is installed, what runs on this machine, and how to get what is missing."""
 
 import importlib
-import logging
 import platform
 import sys
 from dataclasses import dataclass
@@ -88,8 +87,7 @@ def kernels(device) -> list[Finding]:
 
     load_gsplat, *trials = kernels_of(NrfConfig().setup())
     reasons: list[str] = []
-    trial.logger.addHandler(handler := logging.Handler())
-    handler.emit = lambda record: reasons.append(record.getMessage())
+    trial.logger.addFilter(note := lambda record: reasons.append(record.getMessage()))
     try:
         load_gsplat(device)
         gsplat = Finding("gsplat's kernels", "load")
@@ -98,7 +96,7 @@ def kernels(device) -> list[Finding]:
         gsplat = Finding("gsplat's kernels", f"do not load ({type(error).__name__}: {error})", fix, True)
     for attempt in trials:
         attempt(device)
-    trial.logger.removeHandler(handler)
+    trial.logger.removeFilter(note)
     fix = f"Training is slower; install Triton and a C compiler: {' '.join(reasons)}" if reasons else ""
     return [gsplat, Finding("Triton's kernels", "do not all run" if reasons else "run", fix)]
 

@@ -41,6 +41,7 @@ from nrfgs_ns.model.model import NrfgsModel
 from nrfgs_ns.training.checkpoint_files import read
 from nrfgs_ns.training.config_file import read_config
 from nrfgs_ns.training.identity import leaves
+from nrfgs_ns.training.pace import TimedPace
 from nrfgs_ns.training.trainer import NrfgsTrainer
 from nrfgs_ns.training.trainer_config import NrfgsTrainerConfig
 
@@ -98,7 +99,7 @@ class Nrfgs:
         trainer = set_up(config)
         trainer.guard.step = trainer._start_step
         trainer.guard.check_parameters(trainer.optimizers)
-        if trainer.pace is not None:
+        if isinstance(trainer.pace, TimedPace):
             trainer.pace.start()
         self.trainer, self.model, self.step = trainer, trainer.pipeline.model, trainer._start_step
         self.record = {

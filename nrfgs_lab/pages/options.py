@@ -34,7 +34,7 @@ Cameras lie within [-1, 1] scene units.
 SPLATFACTOS = {field.name for field in dataclasses.fields(SplatfactoModelConfig)}
 """Options of splatfacto's model, not explained here."""
 LEFT_OUT = (
-    *("logging.local-writer.enable", "pipeline.datamanager.cache-images-type", "pipeline.sharding.rebalance-at"),
+    *("logging.local-writer.enable", "pipeline.datamanager.cache-images-type"),
     *(APPEARANCE + name for name in ("distance-eps", "implementation", "precision", "output-init", "opacity-bound")),
     *("viewer.websocket-host", "pipeline.datamanager.image-memory", "pipeline.compact", MODEL + "warmup-steps"),
 )

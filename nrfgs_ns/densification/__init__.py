@@ -10,7 +10,7 @@ they share.
 """
 
 from dataclasses import fields
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated
 
 from tyro.constructors import PrimitiveConstructorSpec
 
@@ -37,30 +37,21 @@ def strategy_from(text: str) -> DensificationConfig:
     name, *settings = text.split(",")
     if name not in STRATEGIES:
         raise InputError(f"There is no strategy {name!r}; use one of {', '.join(STRATEGIES)}.")
-    kinds = get_type_hints(STRATEGIES[name])
-    names = [field.name for field in fields(STRATEGIES[name])]
-    options = {}
+    config = STRATEGIES[name]()
+    names = [field.name for field in fields(config)]
     for setting in settings:
-        option, _, value = setting.partition("=")
-        option = option.strip().replace("-", "_")
+        option, _, value = (part.strip() for part in setting.partition("="))
+        option = option.replace("-", "_")
         if option not in names:
             raise InputError(f"{name} has no option {option!r}; it has {', '.join(names)}.")
-        options[option] = _value(f"{name}: {option}", kinds[option], value.strip())
-    config = STRATEGIES[name](**options)
+        kind = type(getattr(config, option))
+        try:
+            setattr(config, option, kind(value))
+        except ValueError:
+            number = "a whole number" if kind is int else "a number"
+            raise InputError(f"{name}: {option} is {value!r}; it must be {number}.") from None
     config.check()
     return config
-
-
-def _value(option: str, kind: Any, text: str) -> Any:
-    """A value of this type."""
-    if get_origin(kind) is Literal:
-        if text in get_args(kind):
-            return text
-        raise InputError(f"{option} is {text!r}; use one of {', '.join(get_args(kind))}.")
-    try:
-        return kind(text)
-    except ValueError:
-        raise InputError(f"{option} is {text!r}; it must be {'a whole' if kind is int else 'a'} number.") from None
 
 
 DensificationChoice = Annotated[

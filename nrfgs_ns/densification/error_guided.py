@@ -30,7 +30,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from nrfgs_ns.densification.statistics import Statistics, accumulate
-from nrfgs_ns.densification.strategy import CHANGE, Densification, DensificationConfig, OpacitySeen, Optimizers, Splats
+from nrfgs_ns.densification.strategy import Densification, DensificationConfig, OpacitySeen, Optimizers, Splats
 
 ERROR = "error"
 """Name in `state`: the largest error of each splat in a view of this window, [N]."""
@@ -117,11 +117,11 @@ class ErrorGuidedDensification(Densification):
 
     def _update_statistics(self, step: int, info: Mapping[str, Any], count: int) -> None:
         """Let the window's maxima be at least the step's; errors only while splats grow."""
-        self.make_tables((ERROR, WIDTH, CHANGE), count, info["radii"].device)
+        self.take_changes(info, count)
+        self.make_tables((ERROR, WIDTH), count, info["radii"].device)
         grows = step < self.grow_until
         norms, gradients = (self.state[ERROR], info["means2d"].absgrad) if grows else (None, None)
-        tables = Statistics(self.state[WIDTH], norms, changes=self.state.get(CHANGE))
-        accumulate(tables, info, 1.0, gradients, info.get("change"))
+        accumulate(Statistics(self.state[WIDTH], norms), info, 1.0, gradients)
 
     # What a refinement does.
 
@@ -143,7 +143,7 @@ class ErrorGuidedDensification(Densification):
             grown = draw(weights.index_fill(0, parents, 0.0), wanted)
         split(splats, optimizers, torch.cat([parents, grown]), places)
         made_from = torch.cat([torch.arange(count, device=dead.device).index_copy(0, places, parents), grown])
-        self.take_rows(made_from, count)
+        self.take_rows(made_from)
         self._decay_opacities(step, splats["opacities"])
         if self.verbose:
             print(f"Step {step}: {len(places)} GSs replaced, {len(grown)} split. Now having {count + len(grown)} GSs.")

@@ -102,7 +102,7 @@ class McmcDensification(Densification):
         wanted = max(min(self.budget, int(1.05 * count)) - count, 0)
         wanted = self.room_for(step, info, splats, optimizers, wanted)
         made_from = add_samples(splats, optimizers, wanted)
-        self.take_rows(moved_from[made_from], count)
+        self.take_rows(moved_from[made_from])
 
     def reschedule(self, step_at: Callable[[float], int]) -> None:
         self.start, self.stop = step_at(self.config.warmup_length), step_at(self.config.stop_at)

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Statistics of splats between two refinements: their screen-space gradients and radii, and how much views changed
-their opacity. Growth by gradients sums norms up and counts steps; growth by error keeps the largest norms and changes.
+"""Statistics of splats between two refinements: their screen-space gradients and radii. Growth by gradients sums norms
+up and counts steps; growth by error keeps the largest norms.
 
 On CUDA a Triton kernel updates them (`statistics_triton.py`); elsewhere, and for several cameras, PyTorch does.
 """
 
-import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -24,43 +23,20 @@ class Statistics(NamedTuple):
     """norms of screen-space gradients: their sum where steps are counted, otherwise the largest"""
     counts: Tensor | None = None
     """number of steps that have shown the splat"""
-    changes: Tensor | None = None
-    """largest changes of the splats' opacities (`strategy.change_of`)"""
 
 
-class Step(NamedTuple):
-    """The M splats of a step."""
-
-    rows: Tensor
-    """rows of the tables, int64 [M]"""
-    radii: Tensor
-    """radii in pixels, [M]; rows of radius 0 do not count"""
-    side: float
-    """the image's longer side in pixels, by which radii are divided"""
-    scales: tuple[float, float]
-    """factors in x and y of the gradients, which come by a centre's position in pixels"""
-
-
-def accumulate(
-    tables: Statistics,
-    info: Mapping[str, Any],
-    extent: float,
-    gradients: Tensor | None,
-    change: Tensor | None = None,
-) -> None:
-    """Update the tables, in place, by a step. Norms that are not finite count as 0; changes that are NaN do not count.
+def accumulate(tables: Statistics, info: Mapping[str, Any], extent: float, gradients: Tensor | None) -> None:
+    """Update the tables, in place, by a step. Norms that are not finite count as 0.
 
     Args:
         tables: tables of N splats.
         info: the rasterizer's, of M rows; those of radius 0 belong to invisible splats.
         extent: width and height of the image in the units by which gradients are to be taken.
         gradients: the loss's gradients by the rows' centres in pixels, [M, 2].
-        change: changes of the rows' opacities, [M].
     """
-    width, height, cameras = info["width"], info["height"], info["n_cameras"]
-    scales = width / extent * cameras, height / extent * cameras
-    step = Step(info["gaussian_ids"], info["radii"], float(max(width, height)), scales)
-    tensors = [value for value in (*tables, gradients, change) if value is not None]
+    cameras = info["n_cameras"]
+    scales = info["width"] / extent * cameras, info["height"] / extent * cameras
+    tensors = [value for value in (*tables, gradients) if value is not None]
     update = in_torch
     if (
         tensors[0].is_cuda
@@ -69,23 +45,23 @@ def accumulate(
         and try_kernel(tensors[0].device)
     ):
         from nrfgs_ns.densification.statistics_triton import in_triton as update
-    update(tables, step, gradients, change)
+    update(tables, info, scales, gradients)
 
 
-def in_torch(tables: Statistics, step: Step, gradients: Tensor | None, change: Tensor | None) -> None:
-    """`accumulate` in PyTorch, the kernel's twin."""
-    (widths, norms, counts, changes), (rows, radii, side, scales) = tables, step
+def in_torch(
+    tables: Statistics, info: Mapping[str, Any], scales: tuple[float, float], gradients: Tensor | None
+) -> None:
+    """`accumulate` in PyTorch, the kernel's twin; `scales` are factors in x and y of the gradients."""
+    (widths, norms, counts), rows, radii = tables, info["gaussian_ids"], info["radii"]
     seen = radii > 0
     if widths is not None:
-        widths.scatter_reduce_(0, rows, radii / side, "amax")
+        widths.scatter_reduce_(0, rows, radii / float(max(info["width"], info["height"])), "amax")
     if norms is not None:
         x, y = gradients.unbind(dim=-1)
         norm = torch.hypot(x * scales[0], y * scales[1]).nan_to_num(0.0, 0.0) * seen
         norms.scatter_reduce_(0, rows, norm, "amax" if counts is None else "sum")
     if counts is not None:
         counts.index_add_(0, rows, seen.to(counts.dtype))
-    if changes is not None:
-        changes.scatter_reduce_(0, rows, change.where(seen & ~change.isnan(), -math.inf), "amax")
 
 
 @tried_once("What densification remembers")
@@ -94,7 +70,7 @@ def try_kernel(device: torch.device) -> None:
     from nrfgs_ns.densification.statistics_triton import in_triton
 
     one, gradient = torch.ones(1, device=device), torch.ones(1, 2, device=device)
-    step = Step(torch.zeros(1, dtype=torch.int64, device=device), one.int(), 1.0, (1.0, 1.0))
-    in_triton(Statistics(one, one.clone(), counts=one.clone()), step, gradient, None)
-    for norms in (one.clone(), None):  # while splats grow, and after it
-        in_triton(Statistics(one, norms, changes=one.clone()), step, gradient, one)
+    info = {"gaussian_ids": torch.zeros(1, dtype=torch.int64, device=device), "radii": one.int()}
+    info |= {"width": 1, "height": 1}
+    for norms, counts in ((one.clone(), one.clone()), (one.clone(), None), (None, None)):  # after growth no norms
+        in_triton(Statistics(one, norms, counts), info, (1.0, 1.0), gradient)

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """`statistics.in_torch` as a Triton kernel."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
-from nrfgs_ns.densification.statistics import Statistics, Step
+from nrfgs_ns.densification.statistics import Statistics
 from nrfgs_ns.kernels.launch import Launcher
 
 BLOCK = 256
@@ -15,11 +18,11 @@ BLOCK = 256
 
 @triton.jit(do_not_specialize=["count"])
 def statistics_kernel(
-    widths, norms, counts, changes, rows, radii, gradients, change, count, scale_x, scale_y, radius_scale,
-    BLOCK: tl.constexpr, WIDTHS: tl.constexpr, NORMS: tl.constexpr, COUNTS: tl.constexpr, CHANGES: tl.constexpr,
+    widths, norms, counts, rows, radii, gradients, count, scale_x, scale_y, radius_scale,
+    BLOCK: tl.constexpr, WIDTHS: tl.constexpr, NORMS: tl.constexpr, COUNTS: tl.constexpr,
 ):  # fmt: skip
     """Take the rows of positive radius, which must be all different, into the tables; those that are not wanted
-    (WIDTHS, NORMS, COUNTS, CHANGES) are not touched."""
+    (WIDTHS, NORMS, COUNTS) are not touched."""
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     radius = tl.load(radii + at, mask=at < count, other=0).to(tl.float32)
     valid = radius > 0.0
@@ -38,24 +41,23 @@ def statistics_kernel(
         tl.store(norms + row, tl.maximum(old, norm), mask=valid)
     if COUNTS:
         tl.store(counts + row, tl.load(counts + row, mask=valid, other=0.0) + 1.0, mask=valid)
-    if CHANGES:
-        old = tl.load(changes + row, mask=valid, other=0.0)
-        new = tl.load(change + at, mask=valid, other=0.0)
-        tl.store(changes + row, tl.where(new > old, new, old), mask=valid)  # NaN is not greater
 
 
 launch = Launcher(statistics_kernel)
 
 
-def in_triton(tables: Statistics, step: Step, gradients: Tensor | None, change: Tensor | None) -> None:
+def in_triton(
+    tables: Statistics, info: Mapping[str, Any], scales: tuple[float, float], gradients: Tensor | None
+) -> None:
     """`statistics.in_torch` for dense float32 tensors and rows that are all different."""
-    count = len(step.rows)
+    count = len(info["gaussian_ids"])
     written = [table for table in tables if table is not None]
     if count > 0:
-        arguments = *tables, step.rows, step.radii.contiguous(), gradients, change
+        arguments = *tables, info["gaussian_ids"], info["radii"].contiguous(), gradients
         arguments = (written[0] if value is None else value for value in arguments)  # a pointer that is not used
         wanted = {name.upper(): table is not None for name, table in tables._asdict().items()}
         grid = -(-count // BLOCK), 1, 1
-        launch(grid, *arguments, count, *step.scales, 1 / step.side, BLOCK=BLOCK, **wanted, num_warps=4)
+        radius_scale = 1 / float(max(info["width"], info["height"]))
+        launch(grid, *arguments, count, *scales, radius_scale, BLOCK=BLOCK, **wanted, num_warps=4)
         for table in written:
             torch.autograd.graph.increment_version(table)

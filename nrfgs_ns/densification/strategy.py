@@ -9,7 +9,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, MutableMapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -67,15 +67,6 @@ def shown_opacity(stored: Tensor, change: Tensor) -> Tensor:
     return torch.where(change < 0, stored * (1 + change), stored + change).clamp_max(1.0)
 
 
-def per_splat_state(state: Mapping[str, Any], count: int) -> dict[str, Tensor]:
-    """The entries of a state that have a row for each of `count` splats."""
-    return {
-        name: value
-        for name, value in state.items()
-        if isinstance(value, Tensor) and value.dim() > 0 and len(value) == count
-    }
-
-
 @dataclass
 class DensificationConfig(ABC):
     """Options of a strategy; each has a `budget`, too, the number of splats to grow to (0: as many as the rules give).
@@ -114,6 +105,7 @@ class DensificationConfig(ABC):
             value = getattr(self, field.name)
             if isinstance(value, (int, float)):
                 self.require(0 <= value < math.inf, field.name, "zero or positive")
+        self.require(self.opacity_seen in get_args(OpacitySeen), "opacity_seen", "base or peak")
         self.require(self.refine_every >= 1, "refine_every", "at least 1")
 
     def require(self, holds: bool, name: str, needed: str) -> None:
@@ -204,7 +196,8 @@ class Densification(ABC):
             # Rows first, then the sigmoid, as heads do: in the other order the last bit may differ.
             stored = torch.sigmoid(logits.detach().index_select(0, info["gaussian_ids"])).squeeze(-1)
             changes = change_of(stored, opacities.detach().to(stored.dtype))
-            info["change"] = torch.where(info["radii"] > 0, changes, UNSEEN)
+            # A NaN is the guard's to find; it must not stay in a statistic.
+            info["change"] = torch.where(info["radii"] > 0, changes, UNSEEN).nan_to_num(UNSEEN)
 
     @torch.no_grad()
     def post_backward(self, step: int, info: Mapping[str, Any], splats: Splats, optimizers: Optimizers) -> None:
@@ -222,9 +215,9 @@ class Densification(ABC):
             if name in self.state and self.state[name] is None:
                 self.state[name] = torch.full((count,), UNSEEN if name == CHANGE else 0.0, device=device)
 
-    def take_rows(self, rows: Tensor, count: int) -> None:
-        """Let the statistics, which have `count` rows, become their rows `rows`, int64 [any number], in this order."""
-        self.state.update({name: value[rows] for name, value in per_splat_state(self.state, count).items()})
+    def take_rows(self, rows: Tensor) -> None:
+        """Let the statistics become their rows `rows`, int64 [any number], in this order."""
+        self.state.update({name: value[rows] for name, value in self.state.items() if isinstance(value, Tensor)})
 
     def take_changes(self, info: Mapping[str, Any], count: int) -> None:
         """Let the window's changes of opacity be at least those of a step."""

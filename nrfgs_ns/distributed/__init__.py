@@ -11,7 +11,7 @@ With W devices, a step is the step of one process on the mean of the losses of W
    gradients of what all devices have (the head's shared weights, camera poses) are partial, and summed
    (`trainer.py`).
 
-Densification, pruning, resets and Adam are those of one device, on the shard alone. `shards.py` cuts tables of splats
-up, moves rows when shards drift apart, and puts them together for checkpoints, which are those of one device. Messages
-(`comm.py`) go by NCCL on GPUs and gloo on CPUs.
+Densification, pruning, resets and Adam are those of one device, on the shard alone. Checkpoints, too, are those of one
+device: tables of splats are put together for them, and cut up where they are loaded. Messages (`comm.py`) go by NCCL on
+GPUs and gloo on CPUs.
 """

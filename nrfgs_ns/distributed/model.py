@@ -1,7 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The model on one of several devices: a shard of the splats, rendered from the cameras of all."""
+"""The model on one of several devices: a shard of the splats, rendered from the cameras of all.
 
-from collections.abc import Mapping
+What belongs to a splat is where it is: its row of each parameter, of Adam's two moments (`trainer.py`), and of
+densification's statistics.
+"""
+
+from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,16 +17,28 @@ from nrfgs_ns.appearance.head import ViewNoise
 from nrfgs_ns.densification import Densification
 from nrfgs_ns.distributed import comm
 from nrfgs_ns.distributed.exchange import send_to_cameras
-from nrfgs_ns.distributed.shards import map_model_rows, own_rows, rebalance, shard_counts
-from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.photograph import PhotographModel
 from nrfgs_ns.model.loss import shrinkage
 from nrfgs_ns.model.model import NrfgsModel
 from nrfgs_ns.rasterizer import Pinhole, Projection, View, project, project_view
-from nrfgs_ns.training.pipeline import ShardingConfig
 
 ROWS = "camera_ids", "gaussian_ids", "radii", "means2d", "depths", "n_cameras"
 """Columns of a projection that densification reads in `info`."""
+
+
+def own_rows(table: Tensor) -> Tensor:
+    """This device's rows of a whole table. They are dealt out in turn, because neighbours in a point cloud are
+    neighbours in space, and each camera should see equally many splats of each device."""
+    return table[comm.rank() :: comm.world()]
+
+
+def map_model_rows(state: Mapping[str, Any], change: Callable[[Tensor], Any], prefix: str = "") -> dict[str, Any]:
+    """A model's state, named after `prefix`, with each table of splats and of densification's statistics changed."""
+    rows = f"{prefix}gauss_params."
+    extra = state[f"{prefix}_extra_state"]
+    strategy = {name: change(v) if isinstance(v, Tensor) else v for name, v in extra["strategy"].items()}
+    changed = {name: change(value) if name.startswith(rows) else value for name, value in state.items()}
+    return {**changed, f"{prefix}_extra_state": {**extra, "strategy": strategy}}
 
 
 class ShardedModel(NrfgsModel):
@@ -37,10 +53,7 @@ class ShardedModel(NrfgsModel):
     """every device's splats, [W]"""
 
     def populate_modules(self):
-        self.sharding: ShardingConfig = self.kwargs["sharding"]
         super().populate_modules()
-        if self.trimming is not None:
-            raise InputError("pipeline.model.robust_loss is for one device. Leave it out.")
         self.view_noise = ViewNoise(0.0, self.view_noise.seed + comm.rank())  # each device has other splats
 
     def _strategy(self) -> Densification:
@@ -51,9 +64,9 @@ class ShardedModel(NrfgsModel):
         return strategy
 
     def _initial_splats(self) -> dict[str, Tensor]:
-        whole = super()._initial_splats()
-        self.counts = shard_counts(len(whole["means"]), comm.world())
-        return {name: own_rows(value).clone() for name, value in whole.items()}
+        own = {name: own_rows(value).clone() for name, value in super()._initial_splats().items()}
+        self.counts = comm.gather(len(own["means"]))
+        return own
 
     def start_from(self, seed_points: tuple[Tensor, Tensor]) -> None:
         """Start from the main device's points: others may round differently."""
@@ -67,11 +80,6 @@ class ShardedModel(NrfgsModel):
     @property
     def num_splats(self) -> int:
         return sum(self.counts)
-
-    @property
-    def parameter_bytes(self) -> int:
-        row = sum(value.shape[1:].numel() * value.element_size() for value in self.gauss_params.values())
-        return row * self.num_splats + sum(weight.nbytes for weight in self.head.parameters())
 
     # Rendering.
 
@@ -135,8 +143,6 @@ class ShardedModel(NrfgsModel):
         self.densification.post_backward(step, self._screen_info(), self.gauss_params, self.optimizers)
         if step % self.config.densification.refine_every == 0:
             self.count()
-            if max(self.counts) > self.sharding.rebalance_at * sum(self.counts) / len(self.counts):
-                self.counts = rebalance(self.gauss_params, self.optimizers, self.densification.state, self.counts)
 
     def count(self) -> None:
         """Update `counts` from all devices."""
@@ -177,5 +183,6 @@ class ShardedModel(NrfgsModel):
 
     def load_state_dict(self, state: dict[str, Any], strict: bool = True, **kwargs):
         """Load this device's rows of a whole checkpoint. See `NrfgsModel.load_state_dict`."""
-        self.counts = shard_counts(len(state["gauss_params.means"]), comm.world())
-        return super().load_state_dict(map_model_rows(state, own_rows), strict=strict, **kwargs)
+        result = super().load_state_dict(map_model_rows(state, own_rows), strict=strict, **kwargs)
+        self.count()
+        return result

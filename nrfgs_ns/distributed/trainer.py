@@ -3,9 +3,8 @@
 main one writes checkpoints of the whole."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -15,11 +14,11 @@ from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import comms
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
+from torch.nn import Parameter
 from torch.optim import Optimizer
 
 from nrfgs_ns.distributed import comm
-from nrfgs_ns.distributed.model import ShardedModel
-from nrfgs_ns.distributed.shards import map_model_rows, map_moments, own_rows
+from nrfgs_ns.distributed.model import ShardedModel, map_model_rows, own_rows
 from nrfgs_ns.training.averaging import ParameterMean
 from nrfgs_ns.training.guard import MAX_GRADIENT, Guard, TrainingStopped, Verdict, Watched
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
@@ -40,7 +39,7 @@ class ShardedPipeline(NrfgsPipeline):
     model: ShardedModel
 
     def __init__(self, config: NrfgsPipelineConfig, device: str, test_mode: str = "val", world_size: int = 1, **kwargs):
-        config = replace(config, model=replace(config.model, _target=partial(ShardedModel, sharding=config.sharding)))
+        config = replace(config, model=replace(config.model, _target=ShardedModel))
         super().__init__(config, device, test_mode, world_size=1, **kwargs)
         self.world_size = world_size
         torch.manual_seed(torch.initial_seed() + 1 + comm.rank())
@@ -60,8 +59,6 @@ class ShardedPipeline(NrfgsPipeline):
 class ShardedMean(ParameterMean):
     """`ParameterMean` of one device's splats and of the shared weights. If one device must restart, all do, so that
     shared weights stay the same. A training that goes on averages its own steps."""
-
-    is_saved = False
 
     def is_current(self, optimizers: Mapping[str, Optimizer]) -> bool:
         """Whether the rows of all devices still denote the splats that were averaged. The host waits for the answer."""
@@ -121,6 +118,15 @@ class ShardedGuard(Guard):
         return TrainingStopped(f"On device {device} of {comm.world()}: {message}", step, origin, savable)
 
 
+def map_moments(state: Mapping[str, Any], change: Callable[[Tensor], Any]) -> dict[str, Any]:
+    """The state of one of the splats' optimisers with its moments changed; Adam's step counter, a scalar, stays."""
+    moments = {
+        index: {key: change(v) if isinstance(v, Tensor) and v.dim() > 0 else v for key, v in entry.items()}
+        for index, entry in state["state"].items()
+    }
+    return {**state, "state": moments}
+
+
 class ShardedOptimizers(LeanOptimizers):
     """The optimisers of one device: gradients of what all devices have are summed before the step."""
 
@@ -134,12 +140,12 @@ class ShardedOptimizers(LeanOptimizers):
         comm.sum_over_devices([gradient for gradient in gradients if gradient is not None])
         super().step()
 
-    def load_optimizers(self, loaded_state: dict[str, Any]) -> None:
+    def load_optimizers(self, loaded_state: dict[str, Any], weights: Sequence[Parameter] = ()) -> None:
         """Load this device's rows of a whole checkpoint."""
         own = dict(loaded_state)
         for name in self.model.gauss_params:
             own[name] = map_moments(own[name], own_rows)
-        super().load_optimizers(own)
+        super().load_optimizers(own, weights)
 
 
 class ShardedTrainer(NrfgsTrainer):

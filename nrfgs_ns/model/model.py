@@ -137,8 +137,9 @@ class NrfgsModel(ExportedModel):
 
     @property
     def parameter_bytes(self) -> int:
-        """Bytes that a renderer needs (`Field.bytes`)."""
-        return self.field.bytes
+        """Bytes that a renderer of all splats needs."""
+        row = sum(value.shape[1:].numel() * value.element_size() for value in self.gauss_params.values())
+        return row * self.num_splats + sum(weight.nbytes for weight in self.head.parameters())
 
     # Rendering.
 

@@ -32,9 +32,6 @@ def window(average_steps: int, total: int) -> int:
 class ParameterMean:
     """A running mean, m += (p - m) / n, of all parameters that a training's optimisers hold; `count` is n, or 0."""
 
-    is_saved: bool = True
-    """whether checkpoints hold it"""
-
     def __init__(self):
         self.forget()
 

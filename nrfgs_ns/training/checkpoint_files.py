@@ -28,10 +28,6 @@ class DiskFull(ForTheUser, RuntimeError):
     """A checkpoint could not be written: no space, a quota, or a limit on file sizes."""
 
 
-class Damaged(InputError):
-    """A file is not the checkpoint that was written."""
-
-
 def allow_nerfstudio_checkpoints() -> None:
     """Let `torch.load(weights_only=True)` read numpy scalars, plain data in the state of nerfstudio's schedulers."""
     scalar = np._core.multiarray.scalar
@@ -77,7 +73,7 @@ def write(folder: Path, step: int, content: dict[str, Any], only_latest: bool = 
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Read a checkpoint into host memory; Damaged where a byte is not as it was written."""
+    """Read a checkpoint into host memory; InputError where a byte is not as it was written."""
     allow_nerfstudio_checkpoints()
     try:
         with zipfile.ZipFile(path) as archive:
@@ -91,7 +87,7 @@ def read(path: Path) -> dict[str, Any]:
         raise
     except Exception as error:  # damage to a zip archive, or to a pickle in it, can raise anything
         reason = next(iter(str(error).splitlines()), type(error).__name__)[:200]
-        raise Damaged(f"{path} is damaged: {reason}. Restore it from a copy, or take another one.") from error
+        raise InputError(f"{path} is damaged: {reason}. Restore it from a copy, or take another one.") from error
 
 
 def read_latest(folder: Path, step: int | None = None) -> tuple[Path, dict[str, Any]]:
@@ -106,7 +102,7 @@ def read_latest(folder: Path, step: int | None = None) -> tuple[Path, dict[str, 
     for path in checkpoints.values():
         try:
             content = read(path)
-        except Damaged as damage:
+        except InputError as damage:
             damages.append(str(damage))
         else:
             if damages:

@@ -18,14 +18,11 @@ rasterizer does not draw them, so no gradient shows them) are removed before the
 
 import math
 from collections import defaultdict
-from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
 import torch
-from gsplat.strategy.ops import _update_param_with_optimizer
+from gsplat.strategy.ops import remove
 from torch import Tensor
-from torch.nn import Parameter
-from torch.optim import Optimizer
 
 from nrfgs_ns.errors import ForTheUser
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
@@ -182,9 +179,8 @@ class Guard:
         largest = torch.finfo(torch.float32).max
         message = report(self.pipeline, self.step, findings, largest)
         splats = [_within(values, largest) for name, _, values in findings if name.startswith("gauss_params.")]
-        kept = torch.stack(splats).all(0).nonzero()[:, 0] if len(splats) == len(findings) else ()
-        if savable := len(kept) > 0:
-            take_rows(self.model, optimizers.optimizers, kept)
+        if savable := len(splats) == len(findings) and bool((kept := torch.stack(splats).all(0)).any()):
+            remove(self.model.gauss_params, optimizers.optimizers, self.model.densification.state, ~kept)
             message += f"\nThe checkpoint of step {self.step} is this state without them; with --load-dir, it goes on."
         else:
             message += "\nNothing has been written: the checkpoint before, if there is one, is the last good state."
@@ -209,21 +205,6 @@ def report(pipeline, step: int, findings: list[tuple[str, float, Tensor]], limit
     index = getattr(model, "watched_image", None)
     image = "of this step" if index is None else pipeline.datamanager.train_dataset.image_filenames[index]
     return "\n".join([*lines, f"Likely cause: {_cause(model, [name for name, _, _ in findings], image)}"])
-
-
-@torch.no_grad()
-def take_rows(model, optimizers: Mapping[str, Optimizer], rows: Tensor) -> None:
-    """Let the given rows, in this order, be the splats: parameters, optimisers' moments, densification's statistics.
-
-    Args:
-        model: an NrfgsModel; entries of its `gauss_params` are replaced.
-        optimizers: by group; those of `gauss_params` among them.
-        rows: of the table, int64.
-    """
-    model.densification.take_rows(rows, model.num_points)
-    _update_param_with_optimizer(
-        lambda _, old: Parameter(old.detach()[rows]), lambda _, old: old[rows], model.gauss_params, optimizers
-    )
 
 
 def _within(tensor: Tensor, limit: float) -> Tensor:

@@ -32,8 +32,8 @@ class LeanOptimizers(Optimizers):
         super().__init__(config, param_groups)
         self.steps_per_log = steps_per_log
         self.pace = pace
-        self._tables: dict[torch.device, Any] = {}
-        """not shared with a twin's, since the host waits for the copy of the last step's"""
+        self._table: Any = None
+        """the kernel's `AdamTable`, not shared with a twin's, since the host waits for the copy of the last step's"""
         for optimizer in self.optimizers.values():
             if isinstance(optimizer, Adam) and all(parameter.is_cuda for parameter in parameters_of(optimizer)):
                 for group in optimizer.param_groups:
@@ -52,7 +52,7 @@ class LeanOptimizers(Optimizers):
     def step(self) -> None:
         """One step of all optimisers."""
         plain = [optimizer for name, optimizer in self.optimizers.items() if self._is_plain(name)]
-        stepped = plain if step_at_once(plain, self._tables) else []
+        stepped = plain if self.step_at_once(plain) else []
         for name, optimizer in self.optimizers.items():
             if optimizer not in stepped:
                 if (max_norm := self.config[name]["optimizer"].max_norm) is not None:
@@ -69,6 +69,29 @@ class LeanOptimizers(Optimizers):
             and all(optimizer.state.get(p) for p in parameters_of(optimizer) if p.grad is not None)
         )
 
+    def step_at_once(self, optimizers: Sequence[Adam]) -> bool:
+        """Make one step of fused Adams that have state by one Triton kernel, if it runs; returns whether it did. As in
+        torch, the step changes nothing where `found_inf`, a tensor that they share, is 1."""
+        work = [
+            (group, parameter, optimizer.state[parameter])
+            for optimizer in optimizers
+            for group in optimizer.param_groups
+            for parameter in group["params"]
+            if parameter.grad is not None
+        ]
+        if not work or (device := work[0][1].device).type != "cuda" or not try_kernel(device):
+            return False
+        from nrfgs_ns.training.adam_triton import AdamTable
+
+        self._table = self._table or AdamTable(device)
+        counters = [state["step"] for _, _, state in work]
+        with torch.no_grad():
+            torch._foreach_add_(counters, 1)
+            done = self._table.step(work, getattr(optimizers[0], "found_inf", None))
+            if not done:
+                torch._foreach_sub_(counters, 1)
+        return done
+
     def scheduler_step_all(self, step: int) -> None:
         if self.pace is not None:
             self.pace.advance()
@@ -79,14 +102,11 @@ class LeanOptimizers(Optimizers):
             if step % self.steps_per_log == 0:
                 writer.put_scalar(name=f"learning_rate/{name}", scalar=scheduler.get_last_lr()[0], step=step)
 
-    def replace_parameters(self, name: str, parameters: list[Parameter]) -> None:
-        """Replace a group's parameters, at its learning rate and schedule."""
-        optimizer = self.optimizers[name]
-        optimizer.param_groups[0]["params"] = self.parameters[name] = parameters
-        optimizer.state.clear()
-
-    def load_optimizers(self, loaded_state) -> None:
-        """Load the moments; options such as learning rates, or whether Adam is fused, stay this training's."""
+    def load_optimizers(self, loaded_state, weights: Sequence[Parameter] = ()) -> None:
+        """Load the moments; options such as learning rates, or whether Adam is fused, stay this training's. `weights`
+        are the head's, which is another one than was built if the checkpoint's is smaller."""
+        if weights:
+            self.optimizers["field"].param_groups[0]["params"] = self.parameters["field"] = list(weights)
         for name, state in loaded_state.items():
             optimizer = self.optimizers[name]
             optimizer.load_state_dict({**state, "param_groups": optimizer.state_dict()["param_groups"]})
@@ -96,37 +116,8 @@ class LeanOptimizers(Optimizers):
         for name, state in loaded_state.items():
             scheduler = self.schedulers[name]
             scheduler.load_state_dict({**state, "base_lrs": scheduler.base_lrs})
-            parts = self.optimizers[name].param_groups, scheduler.base_lrs, scheduler.lr_lambdas
-            for group, base, factor in zip(*parts, strict=True):
-                group["lr"] = base * factor(scheduler.last_epoch)
-
-
-def step_at_once(optimizers: Sequence[Adam], tables: dict[torch.device, Any]) -> bool:
-    """Make one step of several fused Adams that have state by one Triton kernel, if it runs; returns whether it did. As
-    in torch, the step changes nothing where the optimisers' `found_inf`, a tensor on the device, is 1. `tables` keeps
-    the device's `AdamTable`."""
-    work = [
-        (group, parameter, optimizer.state[parameter])
-        for optimizer in optimizers
-        for group in optimizer.param_groups
-        for parameter in group["params"]
-        if parameter.grad is not None
-    ]
-    device = work[0][1].device if work else torch.device("cpu")
-    skips = [getattr(optimizer, "found_inf", None) for optimizer in optimizers]
-    if device.type != "cuda" or any(skip is not skips[0] for skip in skips) or not try_kernel(device):
-        return False
-    from nrfgs_ns.training.adam_triton import AdamTable
-
-    counters = [state["step"] for _, _, state in work]
-    with torch.no_grad():
-        torch._foreach_add_(counters, 1)
-        if device not in tables:
-            tables[device] = AdamTable(device)
-        done = tables[device].step(work, skips[0])
-        if not done:
-            torch._foreach_sub_(counters, 1)
-    return done
+            (group,), (factor,) = self.optimizers[name].param_groups, scheduler.lr_lambdas
+            group["lr"] = scheduler.base_lrs[0] * factor(scheduler.last_epoch)
 
 
 @tried_once("Adam")

@@ -10,8 +10,9 @@ a training of L steps. A training of another length can walk through the same sc
 
       rate(p) = seconds per step / seconds left * integral_p^L c(u) / c(p) du
 
-  where c(u) is the relative cost of a step at position u. A wrong c makes the walk uneven but does not move its end:
-  training stops when the time is up.
+  where c(u) is the relative cost of a step at position u: half as much at half the resolution, which has a quarter of
+  the pixels and all splats. A wrong c makes the walk uneven but does not move its end: training stops when the time is
+  up.
 
 Adam's averages and the distances between refinements and between resets of opacity, which must see every view, stay
 in steps.
@@ -19,6 +20,8 @@ in steps.
 
 import math
 from collections import deque
+from collections.abc import Sequence
+from itertools import pairwise
 from statistics import median
 from time import perf_counter
 from typing import Any
@@ -38,8 +41,6 @@ ROUNDING = 1e-6
 STEPS_IN_MEDIAN = 51
 """Steps in the median that estimates a step's duration, so that evaluations and checkpoints in between do not count."""
 
-Phases = list[tuple[float, float]]
-
 
 def steps_for(views: int) -> int:
     """Steps for a capture: with more, few views are learnt by heart."""
@@ -54,9 +55,6 @@ class Pace:
         self.rate = rate
         self.position = 0.0
         """0 at the first step, at most L"""
-
-    def start(self) -> None:
-        """Training begins, or goes on, now."""
 
     def advance(self) -> None:
         """Move on to the next step's position."""
@@ -88,14 +86,14 @@ class TimedPace(Pace):
     Args:
         seconds: the budget from the start of training to the end of its last step, including warm-up, evaluations,
             checkpoints and pauses.
-        phases: pairs (position at which the phase ends, relative cost of a step in it), the last ending at infinity.
+        doublings: positions at which the resolution doubles, ascending.
         clock: seconds, for tests.
     """
 
-    def __init__(self, length: int, seconds: float, phases: Phases | None = None, clock=perf_counter):
+    def __init__(self, length: int, seconds: float, doublings: Sequence[int] = (), clock=perf_counter):
         super().__init__(length)
         self.seconds = seconds
-        self.phases = phases or [(math.inf, 1.0)]
+        self.doublings = doublings
         self.clock = clock
         self.earlier_seconds = 0.0
         """seconds before the checkpoint that the training goes on from"""
@@ -126,6 +124,7 @@ class TimedPace(Pace):
         return math.ceil((self.length - self.position) / self.rate)
 
     def start(self) -> None:
+        """Training begins, or goes on, now."""
         self._training_began = self._advanced = self.clock()
 
     def advance(self) -> None:
@@ -141,16 +140,9 @@ class TimedPace(Pace):
 
     def _cost_ahead(self) -> float:
         """The integral in the module's docstring: the cost of the way to L at rate 1, in steps of the present cost."""
-        total = 0.0
-        begin = self.position
-        present_cost = None
-        for end, cost in self.phases:
-            end = min(end, float(self.length))
-            if end > begin:
-                present_cost = present_cost or cost
-                total += (end - begin) * cost / present_cost
-                begin = end
-        return total
+        ahead = [position for position in self.doublings if self.position < position < self.length]
+        ends = pairwise([self.position, *ahead, self.length])
+        return sum((end - begin) * 2.0**doubled for doubled, (begin, end) in enumerate(ends))
 
     def state(self) -> dict[str, Any]:
         # A budget that is spent but for half a step is spent.
@@ -190,13 +182,3 @@ def resume(pace: Pace | None, saved: dict[str, Any] | None, step: int, steps: in
     else:
         pace.position = float(step)
     pace.plan(steps)
-
-
-def resolution_phases(num_downscales: int, resolution_schedule: int) -> Phases:
-    """Phases for `TimedPace` while the resolution doubles `num_downscales` times.
-
-    A step at half the resolution is taken to cost half as much: it has a quarter of the pixels and all splats.
-    """
-    halvings = range(num_downscales, 0, -1)
-    rising = [(float((num_downscales + 1 - n) * resolution_schedule), 0.5**n) for n in halvings]
-    return [*rising, (math.inf, 1.0)]

@@ -16,7 +16,6 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from nrfgs_ns.data.pictures import picture_names, read_exif
-from nrfgs_ns.errors import InputError
 from nrfgs_ns.image import overlap
 from nrfgs_ns.image.overlap import ENOUGH_KNOWN_STOPS, ENOUGH_STOPS, Looks, Pairs, estimate, slope, spread
 from nrfgs_ns.image.photograph import PhotographModel
@@ -69,14 +68,6 @@ def photograph_model(config: Any, datamanager: Any) -> PhotographModel | None:
         return None
     looks = estimate(pairs, exif, centers) if torch.isfinite(exif).any() else seen
     return PhotographModel(picture_names(dataset.image_filenames), looks.stops, looks.held)
-
-
-def check_same_photographs(own: PhotographModel | None, written: Mapping[str, Any] | None) -> None:
-    """Raise InputError where a checkpoint, with the entry `written`, learnt photographs and this training does not, or
-    the other way round. That the photographs are the same is checked before (`identity.check_data_set`)."""
-    if (own is None) != (written is None):
-        theirs, ours = ("on", "off") if own is None else ("off", "on")
-        raise InputError(f"The checkpoint had --pipeline.model.photographs {theirs}, not {ours}. Set it or train anew.")
 
 
 def exif_of(paths: Sequence[Path], stored: Sequence[Exif] | None) -> list[Exif]:

@@ -37,7 +37,7 @@ from nrfgs_ns.training import optimizers
 from nrfgs_ns.training.checkpoint_files import allow_nerfstudio_checkpoints
 from nrfgs_ns.training.config_file import check_types
 from nrfgs_ns.training.identity import check_data_set, data_set_of
-from nrfgs_ns.training.photographs import check_same_photographs, photograph_model
+from nrfgs_ns.training.photographs import photograph_model
 from nrfgs_ns.training.step_graph import StepGraphs
 from nrfgs_ns.viewer.panel import ViewerPanel
 
@@ -47,10 +47,7 @@ SHOWN = ("psnr", "cc_psnr", "ssim", "cc_ssim", "ms_ssim", "lpips", "l1", "second
 
 @dataclass
 class ShardingConfig:
-    """How the splats are spread over several devices."""
-
-    rebalance_at: float = 1.1
-    """splats move between devices when one has more than this many times the mean"""
+    """No options: a config.yml of version 0.2.0 names this class."""
 
 
 @dataclass
@@ -62,8 +59,6 @@ class NrfgsPipelineConfig(VanillaPipelineConfig):
     """specifies the datamanager config"""
     model: NrfgsModelConfig = field(default_factory=NrfgsModelConfig)
     """specifies the model config"""
-    sharding: ShardingConfig = field(default_factory=ShardingConfig)
-    """with several devices: how the splats are spread over them"""
     compact: Path | None = None
     """read the model from a file of `nrfgs export compact` instead of the checkpoint; not for training"""
 
@@ -127,8 +122,11 @@ class NrfgsPipeline(VanillaPipeline):
         if self.config.compact is not None:
             state = model_state(self.model, decode(self.config.compact))
             loaded_state = {f"_model.{name}": value for name, value in state.items()}
-        if training:
-            check_same_photographs(self.model.photograph, loaded_state.get("_model.photograph._extra_state"))
+        were_learnt = "_model.photograph._extra_state" in loaded_state
+        if training and were_learnt == (self.model.photograph is None):
+            theirs, ours = ("on", "off") if were_learnt else ("off", "on")
+            choice = f"--pipeline.model.photographs {theirs}, not {ours}"
+            raise InputError(f"The checkpoint had {choice}. Set it or train anew.")
         super().load_pipeline(loaded_state, step)
 
     def train(self, mode: bool = True):

@@ -82,14 +82,9 @@ class ProgressLine(LocalWriter):
     def write_stats_log(self, step: int) -> None:
         """Nothing: the trainer calls `update` after each step. Nerfstudio's first call names another step."""
 
-    def update(self, step: int) -> None:
-        """Update the line if it is due."""
-        if perf_counter() >= self._due:
-            self._update(step)
-
     def finish(self, step: int) -> None:
         """Show the result of the last step and leave the line there."""
-        self._update(step, is_last=True)
+        self.update(step, is_last=True)
         self.close()
 
     def close(self) -> None:
@@ -103,8 +98,11 @@ class ProgressLine(LocalWriter):
             self._live.stop()
             self._live = None
 
-    def _update(self, step: int, is_last: bool = False) -> None:
+    def update(self, step: int, is_last: bool = False) -> None:
+        """Update the line if it is due or the training ends."""
         start = perf_counter()
+        if start < self._due and not is_last:
+            return
         total = max(writer.GLOBAL_BUFFER["max_iter"], step + 1)
         done = (step + 1) / total
         parts = [f"step {step + 1:,} of {total:,} ({100 * done:.0f} %)"]

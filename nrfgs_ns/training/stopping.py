@@ -87,7 +87,6 @@ def _say(line: str) -> None:
 
 def _let_go_of_terminal() -> None:
     """Discard all further output: writing to a terminal that is gone is an error."""
-    nowhere = os.open(os.devnull, os.O_RDWR)
-    for stream in (0, 1, 2):
-        os.dup2(nowhere, stream)
-    os.close(nowhere)
+    with open(os.devnull, "r+b") as nowhere:
+        for stream in (0, 1, 2):
+            os.dup2(nowhere.fileno(), stream)

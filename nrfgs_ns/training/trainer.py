@@ -143,9 +143,7 @@ class NrfgsTrainer(Trainer):
             schedules = "" if config.schedule_steps is None else f" --schedule-steps {config.schedule_steps}"
             longer = f"--max-num-iterations {2 * self._start_step}{schedules} makes as many more"
             raise InputError(f"{path} is the end of a training of {self._start_step:,} steps: {longer}.")
-        if weights := list(self.pipeline.model.head.parameters()):  # of a smaller head, perhaps, than was built
-            self.optimizers.replace_parameters("field", weights)
-        self.optimizers.load_optimizers(content["optimizers"])
+        self.optimizers.load_optimizers(content["optimizers"], list(self.pipeline.model.head.parameters()))
         if config.load_scheduler:
             self.optimizers.load_schedulers(content["schedulers"])
         resume(self.pace, training.get("pace"), self._start_step, left, self.world_size)
@@ -153,7 +151,7 @@ class NrfgsTrainer(Trainer):
             self.config = replace(self.config, max_num_iterations=left)
         if self.pace is not None:
             self.pipeline.model.schedule_at(int(self.pace.position))
-        if self.mean is not None and self.mean.is_saved and training.get("parameter_mean") is not None:
+        if self.mean is not None and self.world_size == 1 and "parameter_mean" in training:
             self.mean.load_state(training["parameter_mean"], self.optimizers.optimizers)
         if self.twin is not None and "twin" not in training:
             warn("The checkpoint is of a training without a twin, which goes on without one.")
@@ -183,11 +181,10 @@ class NrfgsTrainer(Trainer):
         self._check_parameters(self._start_step)
         if isinstance(self.pace, TimedPace):  # the clock says which step is the last
             self.config = replace(self.config, max_num_iterations=sys.maxsize // 2)
+            self.pace.start()
         gc.collect()
         gc.freeze()  # all present objects stay: the collector need not visit them
         try:
-            if self.pace is not None:
-                self.pace.start()
             with heard_signals(self.request), self._state_on_disk_if_it_fails():
                 super().train()
         finally:
@@ -384,7 +381,7 @@ class NrfgsTrainer(Trainer):
         training: dict[str, Any] = {"options": options_of(self.config)}
         if self.pace is not None:
             training["pace"] = self.pace.state()
-        if self.mean is not None and self.mean.is_saved and self.mean.count > 0:
+        if self.mean is not None and self.world_size == 1 and self.mean.count > 0:
             training["parameter_mean"] = self.mean.state()
         if self.twin is not None:
             training["twin"] = self.twin.state()

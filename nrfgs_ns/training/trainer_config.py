@@ -21,7 +21,7 @@ from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.config_file import check_types
-from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS, Pace, TimedPace, resolution_phases, steps_for
+from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS, Pace, TimedPace, steps_for
 
 AVERAGED = 200
 """Steps to average in the presets and where the steps are chosen by the views."""
@@ -98,11 +98,13 @@ class NrfgsTrainerConfig(TrainerConfig):
                 raise InputError(f"{name} is {value}; it must be {least}, and below 2^32.")
         if devices == 1 and self.machine.device_type == "cuda" and not torch.cuda.is_available():
             raise InputError("machine.device_type is cuda, but PyTorch finds no GPU (`nrfgs doctor`). Give cpu.")
-        has_twin = self.pipeline.model.twin == "on"
-        if devices > 1 and (has_twin or (self.time_budget or self.schedule_steps) is not None):
-            raise InputError("time_budget, schedule_steps and pipeline.model.twin are for one device. Leave them out.")
         check_types(self.pipeline, "config.yml", "pipeline.")
-        self.pipeline.model.check()
+        model = self.pipeline.model
+        model.check()
+        is_of_one = model.twin == "on" or model.robust_loss > 0 or (self.time_budget or self.schedule_steps) is not None
+        if devices > 1 and is_of_one:
+            names = "time_budget, schedule_steps, pipeline.model.twin and pipeline.model.robust_loss"
+            raise InputError(f"{names} are for one device. Leave them out.")
         if self.load_step is not None and self.load_dir is None:
             raise InputError(f"load_step is {self.load_step}, but there is no --load-dir. Give the folder, too.")
         if None not in (self.load_dir, self.load_checkpoint):
@@ -128,8 +130,8 @@ class NrfgsTrainerConfig(TrainerConfig):
         length = self.schedule_steps or self.max_num_iterations
         if self.time_budget is not None:
             model = self.pipeline.model
-            phases = resolution_phases(model.num_downscales, model.resolution_schedule)
-            return TimedPace(length, 60.0 * self.time_budget, phases)
+            doublings = [model.resolution_schedule * n for n in range(1, model.num_downscales + 1)]
+            return TimedPace(length, 60.0 * self.time_budget, doublings)
         return None if self.schedule_steps is None else Pace(length, length / self.max_num_iterations)
 
     def print_to_terminal(self) -> None:

@@ -145,9 +145,7 @@ class Twin:
 
     def load_state(self, state: dict[str, Any]) -> None:
         self.pipeline.model.load_state_dict(state["model"])
-        if weights := list(self.pipeline.model.head.parameters()):
-            self.optimizers.replace_parameters("field", weights)
-        self.optimizers.load_optimizers(state["optimizers"])
+        self.optimizers.load_optimizers(state["optimizers"], list(self.pipeline.model.head.parameters()))
 
 
 def twin_of(trainer) -> Twin | None:

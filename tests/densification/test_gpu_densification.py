@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 from nrfgs_ns.densification import statistics
 from nrfgs_ns.densification.mcmc import add_noise, split_evenly
-from nrfgs_ns.densification.statistics import Statistics, Step
+from nrfgs_ns.densification.statistics import Statistics
 
 pytestmark = pytest.mark.gpu
 
@@ -62,12 +62,11 @@ def test_one_camera_is_the_kernels(monkeypatch, counts):
     rows = torch.randperm(5000, device="cuda")[:3000]
     radii = torch.randint(0, 90, (3000,), dtype=torch.int32, device="cuda")
     info = {"width": 640, "height": 480, "n_cameras": 1, "gaussian_ids": rows, "radii": radii}
-    last = torch.full((5000,), 0.0 if counts else -2.0, device="cuda")
-    tables = Statistics(*torch.zeros(2, 5000, device="cuda"), **{"counts" if counts else "changes": last})
-    shown = torch.randn(3000, 2, device="cuda"), None if counts else torch.rand(3000, device="cuda") - 0.5
+    tables = Statistics(*torch.zeros(3 if counts else 2, 5000, device="cuda"))
+    gradients = torch.randn(3000, 2, device="cuda")
     twin = Statistics(*(None if value is None else value.clone() for value in tables))
-    statistics.in_torch(twin, Step(rows, radii, 640.0, (640.0, 480.0)), *shown)
+    statistics.in_torch(twin, info, (640.0, 480.0), gradients)
     monkeypatch.setattr(statistics, "in_torch", None)
-    statistics.accumulate(tables, info, 1.0, *shown)
+    statistics.accumulate(tables, info, 1.0, gradients)
     for value, other in zip(filter(torch.is_tensor, tables), filter(torch.is_tensor, twin), strict=True):
         torch.testing.assert_close(value, other, rtol=1e-6, atol=0.0)

@@ -54,6 +54,14 @@ def test_the_peak_is_forgotten_at_refinement(name):
     assert 7 not in table.splats["latents"][:, 0].long()
 
 
+@pytest.mark.parametrize("name", [*STRATEGIES, "error-guided"])
+def test_an_opacity_that_is_nan_leaves_nothing_behind(name):
+    """On a GPU the guard condemns a step after the strategy has seen it."""
+    table, rules = Table(4), strategy(name, opacity_seen="peak")
+    table.step(rules, 1, shown=torch.tensor([torch.nan, 0.7, 0.5, torch.nan]))
+    assert rules.state[CHANGE].tolist() == pytest.approx([UNSEEN, 0.2, 0.0, UNSEEN], abs=1e-6)
+
+
 # Heads whose opacity is the stored one.
 @pytest.mark.parametrize("name", STRATEGIES)
 def test_a_head_of_stored_opacity_cannot_tell_peak_from_base(name):

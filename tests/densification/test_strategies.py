@@ -120,7 +120,7 @@ def test_a_word_is_a_strategy_with_its_options(text, config, tmp_path):
     ("mcmc,sparkle=0.5", "mcmc has no option 'sparkle'; it has opacity_seen, .*budget"),
     ("mcmc,budget=0", "budget is 0; it must be from 1 to"),
     ("mcmc,budget=many", "budget is 'many'; it must be a whole number"),
-    ("original,opacity_seen=sparkle", "'sparkle'; use one of base, peak"),
+    ("original,opacity_seen=sparkle", "opacity_seen is sparkle; it must be base or peak"),
     ("splatfacto,densify_grad_thresh=nan", "densify_grad_thresh is nan; it must be zero or positive"),
     ("splatfacto,cull_alpha_thresh=0.5", "cull_alpha_thresh is 0.5; it must be below 0.5"),
     ("splatfacto,cull_alpha_thresh=0", "cull_alpha_thresh is 0.0; it must be below 0.5 and above 0"),

@@ -11,14 +11,11 @@ from device import BY_ERROR, PEAK, PIXELS, PLAIN, RICH, one_step, told, train
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
 
-MORE = {"--pipeline.sharding.rebalance-at": 1.0}
-"""Rows move after each refinement that has left the shards unequal."""
 AVERAGED = {
     "--average-steps": 10,
     "--steps-per-save": 7,
     "--save-only-latest-checkpoint": False,
     "--pipeline.model.densification": f"{PEAK},stop_split_at=8",
-    "--pipeline.sharding.rebalance-at": 100.0,
 }
 """Of 12 steps, the mean begins at step 2. The only refinement, at step 4, leaves the shards as it makes them."""
 
@@ -43,7 +40,7 @@ def thirty_steps(scene: Path, folder: Path) -> None:
         model = trainer.pipeline.model
         after_each(trainer, lambda step: counts.append((step, model.num_points, list(model.counts))))
 
-    trainer = train(scene, folder / "thirty", dist.get_world_size(), 30, watch=watch, **PLAIN, **MORE)
+    trainer = train(scene, folder / "thirty", dist.get_world_size(), 30, watch=watch, **PLAIN)
     shared = {name: value.detach().cpu() for name, value in trainer.pipeline.model.head.named_parameters()}
     result = {"counts": counts, "shared": shared, "saved": str(told(trainer))}
     torch.save(result, folder / f"thirty-{dist.get_rank()}.pt")
@@ -56,7 +53,7 @@ def after_each(trainer, do) -> None:
 def there_and_back(scene: Path, folder: Path) -> None:
     """Checkpoints from two devices to one and to two again, looked at before training; both evaluate the first."""
     world, main = dist.get_world_size(), dist.get_rank() == 0
-    two = train(scene, folder / "half", world, 6, **BY_ERROR, **MORE)
+    two = train(scene, folder / "half", world, 6, **BY_ERROR)
     scores, half = [evaluation(two)], told(two)
 
     def look(name: str):
@@ -68,7 +65,7 @@ def there_and_back(scene: Path, folder: Path) -> None:
         return see
 
     one = told(train(scene, folder / "one", 1, 12, load=half, watch=look("one"), **BY_ERROR) if main else None)
-    again = told(train(scene, folder / "two", world, 18, load=one, watch=look("two"), **BY_ERROR, **MORE))
+    again = told(train(scene, folder / "two", world, 18, load=one, watch=look("two"), **BY_ERROR))
     torch.save(scores, folder / f"scores-{dist.get_rank()}.pt")
     if main:
         torch.save([str(path) for path in (half, one, again)], folder / "there-and-back.pt")

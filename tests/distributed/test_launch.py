@@ -62,9 +62,10 @@ def test_scaled_gradients_are_refused(config, option):
         replace(config, **{option: True}).setup(local_rank=0, world_size=2)
 
 
-def test_a_twin_is_refused(config):
-    config = replace(config, pipeline=replace(config.pipeline, model=replace(config.pipeline.model, twin="on")))
-    with pytest.raises(InputError, match="model.twin are for one device"):
+@pytest.mark.parametrize("option", [{"twin": "on"}, {"robust_loss": 0.1}])
+def test_a_twin_and_a_robust_loss_are_refused(config, option):
+    config = replace(config, pipeline=replace(config.pipeline, model=replace(config.pipeline.model, **option)))
+    with pytest.raises(InputError, match="model.twin and pipeline.model.robust_loss are for one device"):
         config.setup(local_rank=0, world_size=2)
 
 

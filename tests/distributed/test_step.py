@@ -18,7 +18,7 @@ from torch.testing import assert_close
 
 from nrfgs_ns.densification import CHANGE
 from nrfgs_ns.distributed import comm
-from nrfgs_ns.distributed.shards import own_rows, shard_counts, transfers
+from nrfgs_ns.distributed.model import own_rows
 
 RELATIVE = 1e-8
 
@@ -86,17 +86,7 @@ def test_every_row_has_one_device(total, devices):
         with patch.multiple(comm, rank=Mock(return_value=rank), world=Mock(return_value=devices)):
             parts.append(own_rows(torch.arange(total)).tolist())
     assert sorted(row for part in parts for row in part) == list(range(total))
-    assert [len(part) for part in parts] == shard_counts(total, devices)
-
-
-@given(st.lists(st.integers(0, 1000), min_size=1, max_size=8))
-def test_transfers_end_in_balance_and_lose_nobody(counts):
-    plan = transfers(counts)
-    after = [count - sum(plan[rank]) + sum(row[rank] for row in plan) for rank, count in enumerate(counts)]
-    assert after == shard_counts(sum(counts), len(counts))
-    for rank, row in enumerate(plan):
-        assert not (sum(row) and sum(other[rank] for other in plan)), "somebody sends and receives"
-        assert row[rank] == 0 and min(row) >= 0 and sum(row) <= counts[rank]
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
 
 
 # Two GPUs with NCCL between them: the step of one process, and a training that densifies.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trainings on two devices: shards stay equal, checkpoints are whole, all stop together."""
+"""Trainings on two devices: shards grow, checkpoints are whole, all stop together."""
 
 from pathlib import Path
 
@@ -23,7 +23,7 @@ def splats_of(content: dict) -> dict[str, torch.Tensor]:
     return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
 
 
-def test_thirty_steps_densify_and_stay_finite_and_balanced(two_devices):
+def test_thirty_steps_densify_and_stay_finite(two_devices):
     first, second = (torch.load(two_devices / f"thirty-{rank}.pt") for rank in (0, 1))
     start, end = first["counts"][0], first["counts"][-1]
     assert [step for step, *_ in first["counts"]] == list(range(30))
@@ -31,7 +31,6 @@ def test_thirty_steps_densify_and_stay_finite_and_balanced(two_devices):
     grown = 0
     for (step, mine, of_all), (_, theirs, of_all_there) in zip(first["counts"], second["counts"], strict=True):
         assert of_all == of_all_there == [mine, theirs], step
-        assert max(of_all) - min(of_all) <= 1, "shards were left apart"
         grown += sum(of_all) != 300
     assert grown > 10
     for name, value in first["shared"].items():

@@ -6,7 +6,7 @@ from unittest.mock import Mock
 
 import pytest
 import torch
-from gsplat.strategy.ops import reset_opa
+from gsplat.strategy.ops import remove, reset_opa
 from nerfstudio.utils.rich_utils import CONSOLE
 from short_trainings import assert_same_training, checkpoint_of, command_line, set_up, trained
 from torch.testing import assert_close
@@ -14,7 +14,7 @@ from torch.testing import assert_close
 from nrfgs_ns.densification.mcmc import add_noise, relocate
 from nrfgs_ns.training import averaging
 from nrfgs_ns.training.averaging import ParameterMean, window
-from nrfgs_ns.training.guard import TrainingStopped, take_rows
+from nrfgs_ns.training.guard import TrainingStopped
 from nrfgs_ns.training.pace import Pace, TimedPace
 from nrfgs_ns.training.trainer import NrfgsTrainer
 
@@ -55,7 +55,7 @@ def a_step(model, optimizers):
 CHANGES = {
     "relocated": (lambda m, adam: relocate(m.gauss_params, adam, torch.arange(len(m.means)) < 3), True),
     "reset": (lambda m, adam: reset_opa(m.gauss_params, adam, {}, 0.2), True),
-    "removed": (lambda m, adam: take_rows(m, adam, torch.arange(1, len(m.means))), True),
+    "removed": (lambda m, adam: remove(m.gauss_params, adam, {}, torch.arange(len(m.means)) < 3), True),
     "noise": (lambda m, adam: add_noise(m.gauss_params, 1.0, torch.zeros(len(m.means))), False),
     "a step": (a_step, False),
 }

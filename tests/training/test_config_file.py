@@ -115,12 +115,17 @@ def test_a_pipeline_refuses_it_too():
 def test_an_option_that_is_newer_than_the_file_has_its_default(read):
     config = replace(method_config.nrfgs.config, average_steps=3)
     text = yaml.dump(config)
-    for option in ("average_steps: 3\n", "    view_noise: 0.5\n", r"  sharding: .*\n(?:    .*\n)+"):
+    for option in ("average_steps: 3\n", "    view_noise: 0.5\n", r"    camera_optimizer: .*\n(?:      .*\n)+"):
         text, count = re.subn(option, "", text)
         assert count == 1
     found = read(text)
     assert found.average_steps is None and found.pipeline.model.view_noise == 0.0
-    assert found.pipeline.sharding == config.pipeline.sharding
+    assert found.pipeline.model.camera_optimizer == config.pipeline.model.camera_optimizer
+
+
+def test_a_group_of_options_that_is_gone_is_read(read):
+    group = "  sharding: !!python/object:nrfgs_ns.training.pipeline.ShardingConfig\n    rebalance_at: 1.1\n"
+    assert read(WHOLE.replace("  model: ", f"{group}  model: ", 1)) == method_config.nrfgs.config
 
 
 def test_a_file_that_is_not_there_or_no_configuration(tmp_path):

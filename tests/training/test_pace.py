@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A time budget is kept whatever steps cost, stretched schedules are the plain ones elsewhere, and both continue."""
 
-import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -18,15 +17,15 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.method_config import nrfgs
 from nrfgs_ns.training import pace, trainer_config
 from nrfgs_ns.training.checkpoint_files import find, read
-from nrfgs_ns.training.pace import Pace, TimedPace, resolution_phases, steps_for
+from nrfgs_ns.training.pace import Pace, TimedPace, steps_for
 
 LENGTH = 30_000
 
 
-def walk(budget, cost, phases=None):
+def walk(budget, cost, doublings=()):
     """A training whose step at a position costs `cost(position, step)` seconds; the pace, its seconds and positions."""
     now, positions = 100.0, []
-    pace = TimedPace(LENGTH, budget, phases, lambda: now)
+    pace = TimedPace(LENGTH, budget, doublings, lambda: now)
     pace.start()
     while not pace.is_spent:
         positions.append(pace.position)
@@ -58,9 +57,8 @@ def test_the_budget_is_kept(first, growth, pause, fits):
 
 
 def test_what_steps_cost_decides_how_evenly_they_are_spread():
-    """Steps at half the resolution take half the time, as the phases say: as many positions for each step early on as
-    later. Without the phases the early steps look cheap for ever, and more of them are made."""
-    phases = resolution_phases(1, 15_000)
+    """Steps at half the resolution take half the time, as the pace takes them to: as many positions for each step early
+    on as later. Of a pace that knows no doubling, early steps look cheap for ever, and more of them are made."""
 
     def cost(position, step):
         return 0.5 if position < 15_000 else 1.0
@@ -68,9 +66,12 @@ def test_what_steps_cost_decides_how_evenly_they_are_spread():
     def early(positions):
         return sum(position < 15_000 for position in positions) / len(positions)
 
-    assert early(walk(3000.0, cost, phases)[2]) == pytest.approx(0.5, abs=0.01)
+    assert early(walk(3000.0, cost, [15_000])[2]) == pytest.approx(0.5, abs=0.01)
     assert early(walk(3000.0, cost)[2]) > 0.55
-    assert resolution_phases(2, 3000) == [(3000.0, 0.25), (6000.0, 0.5), (math.inf, 1.0)]
+    twice = TimedPace(LENGTH, 1.0, [3000, 6000])
+    for position, ahead in ((0.0, 105_000.0), (3000.0, 51_000.0), (6000.0, 24_000.0), (LENGTH, 0.0)):
+        twice.position = position
+        assert twice._cost_ahead() == ahead
 
 
 def test_beyond_the_schedules_the_clock_says_how_many_steps_are_left():
