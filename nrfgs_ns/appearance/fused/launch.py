@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Both kernels as one differentiable function of tables, camera centres and shared weights.
 
-A training step of a small scene is bound by the host, so launches are few: two to pack the weights, one forward, one to
-zero the tables' gradients unless every splat is visible, one backward, two to sum and unpack the weights' gradients.
+A training step of a small scene is bound by the host, so launches are few: two to pack the weights, one forward, four
+to zero the tables' gradients unless every splat is visible, one backward, two to sum and unpack the weights' gradients.
 """
 
 import functools
-import itertools
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -142,13 +141,14 @@ class FusedFunction(torch.autograd.Function):
     def backward(ctx, d_colors, d_opacities):
         packing, launch, options = ctx.packing, ctx.launch, ctx.options
         *tables, visible, centers, packed = ctx.saved_tensors
-        count, rows, device = len(visible), len(tables[0]), visible.device
+        count = len(visible)
         one_center, wants_center = centers.dim() == 1, ctx.needs_input_grad[8]  # of forward's `centers`
         # Without zeros only where the kernel writes each row, once.
-        d_tables = _tables(rows, packing.latent_dim, device, zero=not one_center or count < rows)
+        each_row_once = one_center and count == len(tables[0])
+        d_tables = [torch.empty_like(table) if each_row_once else torch.zeros_like(table) for table in tables]
         d_centers = torch.empty_like(centers) if wants_center else tables[0].new_empty(CENTER_SLOTS)
         if count > 0:
-            programs = _programs(launch, count, device)
+            programs = _programs(launch, count, visible.device)
             partials = tables[0].new_empty(programs, len(packing.gather) + CENTER_SLOTS)
             launch_backward(
                 (programs, 1, 1), *tables, visible, centers, packed,
@@ -219,20 +219,6 @@ def _programs(launch: Launch, count: int, device: torch.device) -> int:
     """Programs to launch: all that run at once, unless there are fewer blocks."""
     at_once = INTERPRETER_PROGRAMS if INTERPRETED.value else launch.programs_per_sm * _multiprocessors(device)
     return min(at_once, math.ceil(count / launch.block))
-
-
-def _tables(rows: int, latent_dim: int, device: torch.device, zero: bool) -> list[Tensor]:
-    """Tables [N, 3], [N, D], [N, 3] and [N, 1], cut from one allocation so that one launch clears them.
-
-    Each begins at a multiple of 16 bytes: Triton compiles another kernel for pointers that do not.
-    """
-    padded = -(-rows // 4) * 4
-    widths = (3, latent_dim, 3, 1)
-    whole = (torch.zeros if zero else torch.empty)(padded * sum(widths), device=device)
-    begins = (0, *itertools.accumulate(widths[:-1]))
-    return [
-        whole.as_strided((rows, width), (width, 1), padded * begin) for width, begin in zip(widths, begins, strict=True)
-    ]
 
 
 def _contiguous(x: Tensor) -> Tensor:
