@@ -70,13 +70,13 @@ class FusedField:
         self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor, scene_unit: float
     ) -> tuple[Tensor, Tensor]:
         """Colours [M, 3] and opacities [M] as `AppearanceHead.forward`'s, where `takes` is true."""
-        from nrfgs_ns.appearance.fused.launch import FieldOptions, FusedFunction
+        from nrfgs_ns.appearance.fused.launch import FusedFunction
 
         weights = [weight for layer in self.layers for weight in (layer.weight, layer.bias)]
         tables = [splats[name] for name in TABLES]
         packing, launches = self._prepared_on(visible.device)
-        options = FieldOptions.of(self.config, scene_unit)
-        return FusedFunction.apply(packing, launches, options, *tables, visible, camera_centers, *weights)
+        options = self.config, scene_unit
+        return FusedFunction.apply(packing, launches, *options, *tables, visible, camera_centers, *weights)
 
     def _prepared_on(self, device: torch.device) -> tuple[Packing, Any] | str:
         """Index maps and launches on `device`, or the reason why there are none; tried and reported once."""
@@ -90,7 +90,7 @@ class FusedField:
                 f"its sizes are beyond the kernels': padded to powers of two, {width} latents or features (at most "
                 f"{MAX_WIDTH}) and {2 * width} x {hidden} weights of the first layer (at most {MAX_WEIGHTS})"
             )
-        from nrfgs_ns.appearance.fused.launch import FieldOptions, first_that_runs
+        from nrfgs_ns.appearance.fused.launch import first_that_runs
 
         packing = self.packing.to(device)
-        return packing, first_that_runs(packing, FieldOptions.of(self.config))
+        return packing, first_that_runs(packing, self.config)

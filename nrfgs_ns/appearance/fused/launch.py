@@ -95,31 +95,14 @@ INTERPRETER_PROGRAMS = 2
 """Programs in Triton's interpreter: as few as show that programs share the work."""
 
 
-class FieldOptions(NamedTuple):
-    """The part of the field's configuration that the kernels need."""
-
-    scalars: tuple[float, ...]
-    """squared smallest distance in world units, log of the world units in a scene unit, s_c, s_alpha, SH_C0"""
-    bound: str
-    """an OpacityBound, or "none" for a field without opacity residual"""
-    precision: str
-
-    @staticmethod
-    def of(config, scene_unit: float = 1.0) -> "FieldOptions":
-        """Options of an NrfConfig."""
-        eps_squared = (config.distance_eps * scene_unit) ** 2
-        scalars = eps_squared, math.log(scene_unit), config.color_scale, config.opacity_scale, SH_C0
-        return FieldOptions(scalars, config.bound if config.opacity_residual else "none", config.precision)
-
-
 class FusedFunction(torch.autograd.Function):
-    """(tables, visible rows, camera centres, shared weights) -> colours [M, 3], opacities [M].
+    """(NrfConfig, tables, visible rows, camera centres, shared weights) -> colours [M, 3], opacities [M].
 
     Camera centres [3] promise that no row of `visible` repeats. All tensors are float32 on one device, `visible` int64.
     """
 
     @staticmethod
-    def forward(ctx, packing: Packing, launches: Launches, options: FieldOptions, means, latents, features_dc,
+    def forward(ctx, packing: Packing, launches: Launches, config, scene_unit: float, means, latents, features_dc,
                 opacities, visible, centers, *weights):  # fmt: skip
         tables = [_contiguous(table) for table in (means, latents, features_dc, opacities)]
         visible, centers = _contiguous(visible), _contiguous(centers)
@@ -127,22 +110,24 @@ class FusedFunction(torch.autograd.Function):
         launch = launches.forward
         count = len(visible)
         outputs = packed.new_empty(count, 3), packed.new_empty(count)
+        eps_squared = (config.distance_eps * scene_unit) ** 2
+        scalars = eps_squared, math.log(scene_unit), config.color_scale, config.opacity_scale, SH_C0
         if count > 0:
             launch_forward(
                 (_programs(launch, count, visible.device), 1, 1), *tables, visible, centers, packed, *outputs,
-                count, *options.scalars, **_constants(packing, launch, options, centers.dim() == 1),
+                count, *scalars, **_constants(packing, launch, config, centers.dim() == 1),
             )  # fmt: skip
         ctx.save_for_backward(*tables, visible, centers, packed)
-        ctx.packing, ctx.launch, ctx.options = packing, launches.backward, options
+        ctx.packing, ctx.launch, ctx.config, ctx.scalars = packing, launches.backward, config, scalars
         return outputs
 
     @staticmethod
     @once_differentiable
     def backward(ctx, d_colors, d_opacities):
-        packing, launch, options = ctx.packing, ctx.launch, ctx.options
+        packing, launch, config = ctx.packing, ctx.launch, ctx.config
         *tables, visible, centers, packed = ctx.saved_tensors
         count = len(visible)
-        one_center, wants_center = centers.dim() == 1, ctx.needs_input_grad[8]  # of forward's `centers`
+        one_center, wants_center = centers.dim() == 1, ctx.needs_input_grad[9]  # of forward's `centers`
         # Without zeros only where the kernel writes each row, once.
         each_row_once = one_center and count == len(tables[0])
         d_tables = [torch.empty_like(table) if each_row_once else torch.zeros_like(table) for table in tables]
@@ -153,8 +138,8 @@ class FusedFunction(torch.autograd.Function):
             launch_backward(
                 (programs, 1, 1), *tables, visible, centers, packed,
                 _contiguous(d_colors), _contiguous(d_opacities), *d_tables, d_centers, partials,
-                count, *options.scalars, SLOTS=partials.shape[1], CENTER=wants_center,
-                GRADIENT_KIND=KINDS[options.precision][1], **_constants(packing, launch, options, one_center),
+                count, *ctx.scalars, SLOTS=partials.shape[1], CENTER=wants_center,
+                GRADIENT_KIND=KINDS[config.precision][1], **_constants(packing, launch, config, one_center),
             )  # fmt: skip
             sums = partials.sum(dim=0)
         else:
@@ -163,7 +148,7 @@ class FusedFunction(torch.autograd.Function):
             d_centers = sums[len(packing.gather) : len(packing.gather) + 3]
         flat = sums.index_select(0, packing.scatter).split([shape.numel() for shape in packing.shapes])
         d_weights = [d.view(shape) for d, shape in zip(flat, packing.shapes, strict=True)]
-        return None, None, None, *d_tables, None, d_centers if wants_center else None, *d_weights
+        return None, None, None, None, *d_tables, None, d_centers if wants_center else None, *d_weights
 
 
 def _packed(packing: Packing, weights: Sequence[Tensor]) -> Tensor:
@@ -172,7 +157,7 @@ def _packed(packing: Packing, weights: Sequence[Tensor]) -> Tensor:
     return torch.cat([*flat, _zero(flat[0].device)]).index_select(0, packing.gather)
 
 
-def _constants(packing: Packing, launch: Launch, options: FieldOptions, one_center: bool) -> dict[str, Any]:
+def _constants(packing: Packing, launch: Launch, config, one_center: bool) -> dict[str, Any]:
     """Constants of both kernels, and options of Triton's compiler."""
     return {
         "D": packing.latent_dim,
@@ -182,21 +167,21 @@ def _constants(packing: Packing, launch: Launch, options: FieldOptions, one_cent
         "B": launch.block,
         "COLUMNS": launch.columns,
         "ONE_CENTER": one_center,
-        "BOUND": options.bound,
-        "KIND": KINDS[options.precision][0],
+        "BOUND": config.bound if config.opacity_residual else "none",
+        "KIND": KINDS[config.precision][0],
         **launch.options(packing.hidden),
     }
 
 
-def first_that_runs(packing: Packing, options: FieldOptions) -> Launches:
-    """The fastest launches that this device can run at these sizes; else raise what goes wrong.
+def first_that_runs(packing: Packing, config) -> Launches:
+    """The fastest launches of an NrfConfig that this device can run at these sizes; else raise what goes wrong.
 
     A missing C compiler and a lack of shared memory show only here. Out-of-memory is re-raised: otherwise a slower
     launch would be kept for good.
     """
-    for launches in LAUNCHES[options.precision]:
+    for launches in LAUNCHES[config.precision]:
         try:
-            probe(packing, launches, options)
+            probe(packing, launches, config)
             return launches
         except torch.OutOfMemoryError:
             raise
@@ -205,13 +190,13 @@ def first_that_runs(packing: Packing, options: FieldOptions) -> Launches:
     raise reason
 
 
-def probe(packing: Packing, launches: Launches, options: FieldOptions) -> None:
+def probe(packing: Packing, launches: Launches, config) -> None:
     """Compile and run both kernels on one splat, for one camera; raise whatever goes wrong."""
     device = packing.gather.device
     tables = [torch.zeros(1, n, device=device, requires_grad=True) for n in (3, packing.latent_dim, 3, 1)]
     weights = [torch.zeros(shape, device=device, requires_grad=True) for shape in packing.shapes]
     visible, center = torch.zeros(1, dtype=torch.int64, device=device), torch.ones(3, device=device)
-    outputs = FusedFunction.apply(packing, launches, options, *tables, visible, center, *weights)
+    outputs = FusedFunction.apply(packing, launches, config, 1.0, *tables, visible, center, *weights)
     sum(output.sum() for output in outputs).backward()
 
 
