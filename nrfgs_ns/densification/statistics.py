@@ -89,7 +89,7 @@ def in_torch(tables: Statistics, step: Step, gradients: Tensor | None, change: T
 
 
 @tried_once("What densification remembers")
-def try_kernel(device: torch.device) -> None:
+def try_kernel(device: torch.device) -> bool:
     """Whether the kernel runs on a CUDA device; the first step would compile it."""
     from nrfgs_ns.densification.statistics_triton import in_triton
 
@@ -98,3 +98,4 @@ def try_kernel(device: torch.device) -> None:
     in_triton(Statistics(one, one.clone(), counts=one.clone()), step, gradient, None)
     for norms in (one.clone(), None):  # while splats grow, and after it
         in_triton(Statistics(one, norms, changes=one.clone()), step, gradient, one)
+    return True

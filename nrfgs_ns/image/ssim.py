@@ -81,9 +81,10 @@ def _similarity(x: Tensor, y: Tensor, xx: Tensor, yy: Tensor, xy: Tensor) -> tup
 
 
 @tried_once("SSIM")
-def kernels_run_on(device: torch.device) -> None:
+def kernels_run_on(device: torch.device) -> bool:
     """Whether Triton's kernels run on a CUDA device."""
     from nrfgs_ns.image.ssim_triton import WeightedSum
 
     image = torch.zeros(WINDOW_SIZE, WINDOW_SIZE, 3, device=device, requires_grad=True)
     WeightedSum.apply(image, torch.zeros_like(image), 0.5, 0.5, 0.0).backward()
+    return True

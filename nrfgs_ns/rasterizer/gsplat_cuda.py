@@ -227,14 +227,15 @@ def _tiles(projection: Projection, side: int) -> int:
 
 
 @tried_once("The list of each tile's splats")
-def _kernels_run_on(device: torch.device) -> None:
+def _kernels_run_on(device: torch.device) -> bool:
     """Whether the kernels of `tile_lists.py` run on a device."""
     for side in (SMALL_TILE, TILE_SIZE):
         _lists_of_one(device, side)
+    return True
 
 
 @tried_once("Compositing of training images, which needs Triton 3.4 or newer,")
-def _compositing_runs_on(device: torch.device) -> None:
+def _compositing_runs_on(device: torch.device) -> bool:
     """Whether the kernels of `compositing_triton.py`, and that which splits lists, run on a device."""
     from .compositing_triton import CompositeSplats
 
@@ -243,6 +244,7 @@ def _compositing_runs_on(device: torch.device) -> None:
     for absgrad in (False, True):
         tables = leaf[:, :2].contiguous(), leaf * 1, leaf[:, 0].contiguous(), leaf * 1, torch.zeros_like(leaf)
         CompositeSplats.apply(*tables, *lists, (1, 1), absgrad)[0].sum().backward()
+    return True
 
 
 def _lists_of_one(device: torch.device, side: int, split: bool = False) -> tuple[Tensor, Tensor]:

@@ -130,7 +130,7 @@ def step_at_once(optimizers: Sequence[Adam], tables: dict[torch.device, Any]) ->
 
 
 @tried_once("Adam")
-def try_kernel(device: torch.device) -> None:
+def try_kernel(device: torch.device) -> bool:
     """Whether Adam's kernel runs on a CUDA device; compiles it before the first step."""
     from nrfgs_ns.training.adam_triton import AdamTable
 
@@ -140,6 +140,7 @@ def try_kernel(device: torch.device) -> None:
     group = {"lr": 0.1, "betas": (0.9, 0.999), "eps": 1e-15, "weight_decay": 0.0}
     with torch.no_grad():
         AdamTable(device).step([(group, number, state)], None)
+    return True
 
 
 def is_fused(optimizer: Optimizer) -> bool:
