@@ -32,7 +32,6 @@ HAS_BATCHES = gsplat_version() >= (1, 5)
 if (installed := ".".join(map(str, gsplat_version()))) not in GSPLAT:
     raise ImportError(f"gsplat {installed} is not known here; use {' or '.join(GSPLAT)}.")
 
-MOST_CHECKED = 8  # channels that the kernels of `tile_lists.py` check for finite numbers
 MOST_TILES = 2**16  # tiles with a 16-bit number, as `tile_lists.py` needs
 SMALL_TILE = 8  # pixels: side of the tiles of images with gradients, which go through the lists twice
 
@@ -119,18 +118,9 @@ def _visible_rows(geometry: tuple[Tensor, ...], cameras: tuple, options: Project
 
 
 def composite(
-    projection: Projection,
-    colors: Tensor,
-    opacities: Tensor,
-    backgrounds: Tensor | None,
-    absgrad: bool,
-    leave_out: bool,
+    projection: Projection, colors: Tensor, opacities: Tensor, backgrounds: Tensor | None, absgrad: bool
 ) -> tuple[Tensor, Tensor, dict]:
-    """Render [C, H, W, D] over backgrounds [C, D], alphas [C, H, W, 1], and gsplat's tile lists for `info`.
-
-    Args:
-        leave_out: do not draw rows that are not finite; only if `leaves_out` allows it.
-    """
+    """Render [C, H, W, D] over backgrounds [C, D], alphas [C, H, W, 1], and gsplat's tile lists for `info`."""
     side = TILE_SIZE
     room = None
     ours = False
@@ -144,7 +134,7 @@ def composite(
     tables = projection.means2d, projection.conics, colors, opacities
     shape = projection.width, projection.height, side
     while True:
-        lists = _lists(projection, opacities, side, room, colors if leave_out else None, ours)
+        lists = _lists(projection, opacities, side, room, ours)
         render, alphas = (_our_image if ours else _gsplats_image)(tables, backgrounds, shape, lists, absgrad)
         if room is None or room.was_enough():
             return render, alphas, {"isect_offsets": lists[0], "flatten_ids": lists[1], "tile_size": side}
@@ -174,20 +164,14 @@ def _our_image(
     return CompositeSplats.apply(means2d, conics, opacities, colors, background, *lists, shape[:2], absgrad)
 
 
-def leaves_out(projection: Projection, colors: Tensor, opacities: Tensor) -> bool:
-    """Whether `composite` can leave out rows that are not finite. Their gradients would not all be 0."""
-    return colors.shape[-1] <= MOST_CHECKED and not torch.is_grad_enabled() and _kernels_take(projection, opacities)
-
-
 def _lists(
-    projection: Projection, opacities: Tensor, side: int, room: Room | None, finite: Tensor | None, split: bool
+    projection: Projection, opacities: Tensor, side: int, room: Room | None, split: bool
 ) -> tuple[Tensor, Tensor]:
     """Offsets into a list of rows, and the list: the splats that each tile draws, as gsplat's kernels take them.
 
     Args:
         side: of a tile, in pixels.
         room: for the kernels of `tile_lists.py`; None: gsplat makes the lists.
-        finite: colours [M, D]; rows that are not finite, in these or otherwise, are left out.
         split: for our compositing alone; see `tile_lists`.
     """
     tile_width, tile_height = -(-projection.width // side), -(-projection.height // side)
@@ -200,8 +184,7 @@ def _lists(
         from .tile_lists import tile_lists
 
         tables = (table.detach().contiguous() for table in (means2d, bounds, depths, conics, opacities))
-        colors = None if finite is None else finite.detach().contiguous()
-        return tile_lists(*tables, tile_width, tile_height, side, colors, room, split)
+        return tile_lists(*tables, tile_width, tile_height, side, room, split)
     images = {"n_cameras": projection.n_cameras, "camera_ids": projection.camera_ids}
     if HAS_BATCHES:
         images = {"n_images": projection.n_cameras, "image_ids": projection.camera_ids}

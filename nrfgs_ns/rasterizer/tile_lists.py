@@ -110,23 +110,16 @@ def _columns(row, x, y, a, b, c, bound, det, left, right, SIDE: tl.constexpr):
 
 @triton.jit(do_not_specialize=["count", "width", "height"])
 def count_kernel(
-    means2d, conics, opacities, radii, order, counts, colors, count, width, height,
-    SPLATS: tl.constexpr, SIDE: tl.constexpr, RADII: tl.constexpr, CHANNELS: tl.constexpr,
+    means2d, conics, opacities, radii, order, counts, count, width, height,
+    SPLATS: tl.constexpr, SIDE: tl.constexpr, RADII: tl.constexpr,
 ):  # fmt: skip
-    """Number of tiles that each splat is listed in, by its place in `order`; with CHANNELS, 0 where a number is not
-    finite."""
+    """Number of tiles that each splat is listed in, by its place in `order`."""
     at = tl.program_id(0) * SPLATS + tl.arange(0, SPLATS)
     valid = at < count
     rows = tl.load(order + at, mask=valid, other=0)
     x, y, a, b, c, bound, det = _ellipse(means2d, conics, opacities, rows, valid)
     left, top, right, bottom = _box(x, y, radii, rows, valid, width, height, SIDE, RADII)
-    drawn = valid & ~(bound <= 0.0)
-    if CHANNELS > 0:
-        total = x + y + a + b + c + bound
-        for channel in tl.static_range(CHANNELS):
-            total += tl.load(colors + rows * CHANNELS + channel, mask=valid, other=0.0)
-        drawn = drawn & (tl.abs(total) < float("inf"))
-    bottom = tl.where(drawn, bottom, top)
+    bottom = tl.where(valid & ~(bound <= 0.0), bottom, top)
     tiles = tl.zeros((SPLATS,), tl.int32)
     for step in range(tl.max(bottom - top, axis=0)):
         row = top + step
@@ -285,7 +278,6 @@ def tile_lists(
     width: int,
     height: int,
     side: int,
-    colors: Tensor | None = None,
     room: Room | FixedRoom | None = None,
     split: bool = False,
 ) -> tuple[Tensor, Tensor]:
@@ -297,7 +289,6 @@ def tile_lists(
         opacities: as composited, compensation included, [M].
         width, height: image size in tiles; with the row below, at most 2^16 that are not split.
         side: side of a tile in pixels, `TILE_SIZE` or a part of it.
-        colors: [M, D]; splats that are not finite, in these or otherwise, are left out. None: no check.
         room: makes room for its number of pairs and is sent the actual one; None: wait for the number.
         split: list in tiles of twice the side, for which there is room, and split these lists.
 
@@ -313,8 +304,8 @@ def tile_lists(
     counts = torch.empty(count, dtype=torch.int32, device=device)
     splats = means2d, conics, opacities, radii, order
     launch_count(
-        (-(-count // SPLATS), 1, 1), *splats, counts, conics if colors is None else colors, count, width, height,
-        SPLATS=SPLATS, SIDE=side, RADII=axes, CHANNELS=0 if colors is None else colors.shape[1], num_warps=2,
+        (-(-count // SPLATS), 1, 1), *splats, counts, count, width, height,
+        SPLATS=SPLATS, SIDE=side, RADII=axes, num_warps=2,
     )  # fmt: skip
     ends = counts.cumsum(0)
     if room is None:
