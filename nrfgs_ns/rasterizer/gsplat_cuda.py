@@ -33,7 +33,6 @@ if (installed := ".".join(map(str, gsplat_version()))) not in GSPLAT:
     raise ImportError(f"gsplat {installed} is not known here; use {' or '.join(GSPLAT)}.")
 
 MOST_TILES = 2**16  # tiles with a 16-bit number, as `tile_lists.py` needs
-SMALL_TILE = 8  # pixels: side of the tiles of images with gradients, which go through the lists twice
 
 
 def load_kernels(device: torch.device) -> None:
@@ -121,20 +120,18 @@ def composite(
     projection: Projection, colors: Tensor, opacities: Tensor, backgrounds: Tensor | None, absgrad: bool
 ) -> tuple[Tensor, Tensor, dict]:
     """Render [C, H, W, D] over backgrounds [C, D], alphas [C, H, W, 1], and gsplat's tile lists for `info`."""
-    side = TILE_SIZE
     room = None
     ours = False
     if len(opacities) > 0 and _kernels_take(projection, opacities):
         from .tile_lists import room_on
 
         room = room_on(opacities.device)
-        if torch.is_grad_enabled():
-            ours = colors.shape[1] == 3 and _compositing_runs_on(colors.device)
-            side = SMALL_TILE if ours or _tiles(projection, SMALL_TILE) <= MOST_TILES else TILE_SIZE
+        ours = torch.is_grad_enabled() and colors.shape[1] == 3 and _compositing_runs_on(colors.device)
+    side = TILE_SIZE // 2 if ours else TILE_SIZE
     tables = projection.means2d, projection.conics, colors, opacities
     shape = projection.width, projection.height, side
     while True:
-        lists = _lists(projection, opacities, side, room, ours)
+        lists = _lists(projection, opacities, side, room)
         render, alphas = (_our_image if ours else _gsplats_image)(tables, backgrounds, shape, lists, absgrad)
         if room is None or room.was_enough():
             return render, alphas, {"isect_offsets": lists[0], "flatten_ids": lists[1], "tile_size": side}
@@ -164,15 +161,12 @@ def _our_image(
     return CompositeSplats.apply(means2d, conics, opacities, colors, background, *lists, shape[:2], absgrad)
 
 
-def _lists(
-    projection: Projection, opacities: Tensor, side: int, room: Room | None, split: bool
-) -> tuple[Tensor, Tensor]:
-    """Offsets into a list of rows, and the list: the splats that each tile draws, as gsplat's kernels take them.
+def _lists(projection: Projection, opacities: Tensor, side: int, room: Room | None) -> tuple[Tensor, Tensor]:
+    """Offsets into a list of rows, and the list: the splats that each tile draws, as the compositing kernels take them.
 
     Args:
-        side: of a tile, in pixels.
+        side: of a tile, in pixels; for our compositing half of gsplat's.
         room: for the kernels of `tile_lists.py`; None: gsplat makes the lists.
-        split: for our compositing alone; see `tile_lists`.
     """
     tile_width, tile_height = -(-projection.width // side), -(-projection.height // side)
     bounds = projection.radii
@@ -184,7 +178,7 @@ def _lists(
         from .tile_lists import tile_lists
 
         tables = (table.detach().contiguous() for table in (means2d, bounds, depths, conics, opacities))
-        return tile_lists(*tables, tile_width, tile_height, side, room, split)
+        return tile_lists(*tables, tile_width, tile_height, room, split=side < TILE_SIZE)
     images = {"n_cameras": projection.n_cameras, "camera_ids": projection.camera_ids}
     if HAS_BATCHES:
         images = {"n_images": projection.n_cameras, "image_ids": projection.camera_ids}
@@ -196,24 +190,19 @@ def _lists(
 
 def _kernels_take(projection: Projection, opacities: Tensor) -> bool:
     """Whether the kernels of `tile_lists.py` make the lists."""
+    tiles = -(-projection.width // TILE_SIZE) * (-(-projection.height // TILE_SIZE) + 1)  # with the row below the image
     return (
         projection.n_cameras == 1
-        and _tiles(projection, TILE_SIZE) <= MOST_TILES
+        and tiles <= MOST_TILES
         and opacities.dtype == projection.means2d.dtype == torch.float32
         and _kernels_run_on(opacities.device)
     )
 
 
-def _tiles(projection: Projection, side: int) -> int:
-    """Tiles of an image and of the row below it."""
-    return -(-projection.width // side) * (-(-projection.height // side) + 1)
-
-
 @tried_once("The list of each tile's splats")
 def _kernels_run_on(device: torch.device) -> bool:
     """Whether the kernels of `tile_lists.py` run on a device."""
-    for side in (SMALL_TILE, TILE_SIZE):
-        _lists_of_one(device, side)
+    _lists_of_one(device)
     return True
 
 
@@ -222,7 +211,7 @@ def _compositing_runs_on(device: torch.device) -> bool:
     """Whether the kernels of `compositing_triton.py`, and that which splits lists, run on a device."""
     from .compositing_triton import CompositeSplats
 
-    lists = _lists_of_one(device, SMALL_TILE, split=True)
+    lists = _lists_of_one(device, split=True)
     leaf = torch.ones(1, 3, device=device, requires_grad=True)
     for absgrad in (False, True):
         tables = leaf[:, :2].contiguous(), leaf * 1, leaf[:, 0].contiguous(), leaf * 1, torch.zeros_like(leaf)
@@ -230,10 +219,10 @@ def _compositing_runs_on(device: torch.device) -> bool:
     return True
 
 
-def _lists_of_one(device: torch.device, side: int, split: bool = False) -> tuple[Tensor, Tensor]:
+def _lists_of_one(device: torch.device, split: bool = False) -> tuple[Tensor, Tensor]:
     """The list of an image's only tile, of one splat."""
     from .tile_lists import tile_lists
 
     ones = torch.ones(1, 3, device=device)
     radii = torch.ones(1, 2, dtype=torch.int32, device=device) if HAS_BATCHES else ones[0, :1].int()
-    return tile_lists(ones[:, :2].contiguous(), radii, ones[0, :1], ones, ones[0, :1], 1, 1, side, split=split)
+    return tile_lists(ones[:, :2].contiguous(), radii, ones[0, :1], ones, ones[0, :1], 1, 1, split=split)

@@ -38,7 +38,7 @@ PAIRS = 256
 """Pairs of a splat and a tile that one program lists; a power of two."""
 BATCH = 256
 """Pairs that one program splits at a time; a power of two, at most 2^15."""
-GSPLATS = tl.constexpr(TILE_SIZE)
+TILE = tl.constexpr(TILE_SIZE)
 """Side of gsplat's tiles in pixels."""
 FIRST = tl.constexpr(-(2**15))
 """The first tile's number."""
@@ -65,22 +65,21 @@ def _ellipse(means2d, conics, opacities, rows, valid):
 
 
 @triton.jit
-def _box(x, y, radii, rows, valid, width, height, SIDE: tl.constexpr, RADII: tl.constexpr):
-    """The tiles inside gsplat's tiles of a splat: first and end of columns and rows."""
-    SHARE: tl.constexpr = GSPLATS // SIDE
-    center_x, center_y = x / GSPLATS, y / GSPLATS
-    reach_x = tl.load(radii + rows * RADII, mask=valid, other=0).to(tl.float32) / GSPLATS
-    reach_y = tl.load(radii + rows * RADII + (RADII - 1), mask=valid, other=0).to(tl.float32) / GSPLATS
-    left = tl.minimum(tl.maximum(tl.floor(center_x - reach_x) * SHARE, 0.0), width).to(tl.int32)
-    top = tl.minimum(tl.maximum(tl.floor(center_y - reach_y) * SHARE, 0.0), height).to(tl.int32)
-    right = tl.minimum(tl.maximum(tl.ceil(center_x + reach_x) * SHARE, 0.0), width).to(tl.int32)
-    bottom = tl.minimum(tl.maximum(tl.ceil(center_y + reach_y) * SHARE, 0.0), height).to(tl.int32)
+def _box(x, y, radii, rows, valid, width, height, RADII: tl.constexpr):
+    """First and end of the columns and rows of gsplat's tiles around a splat."""
+    center_x, center_y = x / TILE, y / TILE
+    reach_x = tl.load(radii + rows * RADII, mask=valid, other=0).to(tl.float32) / TILE
+    reach_y = tl.load(radii + rows * RADII + (RADII - 1), mask=valid, other=0).to(tl.float32) / TILE
+    left = tl.minimum(tl.maximum(tl.floor(center_x - reach_x), 0.0), width).to(tl.int32)
+    top = tl.minimum(tl.maximum(tl.floor(center_y - reach_y), 0.0), height).to(tl.int32)
+    right = tl.minimum(tl.maximum(tl.ceil(center_x + reach_x), 0.0), width).to(tl.int32)
+    bottom = tl.minimum(tl.maximum(tl.ceil(center_y + reach_y), 0.0), height).to(tl.int32)
     return left, top, right, tl.where(reach_x > 0.0, bottom, top)
 
 
 @triton.jit
 def _columns(row, x, y, a, b, c, bound, det, left, right, SIDE: tl.constexpr):
-    """First and end of the columns of tiles in which a splat meets a row of tiles."""
+    """First and end of the columns of tiles of a side in which a splat meets a row of tiles."""
     # Centres of the row's pixels, from the splat's.
     above = row.to(tl.float32) * SIDE + 0.5 - y
     below = above + (SIDE - 1.0)
@@ -111,19 +110,19 @@ def _columns(row, x, y, a, b, c, bound, det, left, right, SIDE: tl.constexpr):
 @triton.jit(do_not_specialize=["count", "width", "height"])
 def count_kernel(
     means2d, conics, opacities, radii, order, counts, count, width, height,
-    SPLATS: tl.constexpr, SIDE: tl.constexpr, RADII: tl.constexpr,
+    SPLATS: tl.constexpr, RADII: tl.constexpr,
 ):  # fmt: skip
     """Number of tiles that each splat is listed in, by its place in `order`."""
     at = tl.program_id(0) * SPLATS + tl.arange(0, SPLATS)
     valid = at < count
     rows = tl.load(order + at, mask=valid, other=0)
     x, y, a, b, c, bound, det = _ellipse(means2d, conics, opacities, rows, valid)
-    left, top, right, bottom = _box(x, y, radii, rows, valid, width, height, SIDE, RADII)
+    left, top, right, bottom = _box(x, y, radii, rows, valid, width, height, RADII)
     bottom = tl.where(valid & ~(bound <= 0.0), bottom, top)
     tiles = tl.zeros((SPLATS,), tl.int32)
     for step in range(tl.max(bottom - top, axis=0)):
         row = top + step
-        first, end = _columns(row, x, y, a, b, c, bound, det, left, right, SIDE)
+        first, end = _columns(row, x, y, a, b, c, bound, det, left, right, TILE)
         tiles += tl.where(row < bottom, end - first, 0)
     tl.store(counts + at, tiles, mask=valid)
 
@@ -131,7 +130,7 @@ def count_kernel(
 @triton.jit(do_not_specialize=["count", "pairs", "width", "height"])
 def list_kernel(
     means2d, conics, opacities, radii, order, ends, tiles, splats, count, pairs, width, height,
-    PAIRS: tl.constexpr, SIDE: tl.constexpr, RADII: tl.constexpr, SPLIT: tl.constexpr,
+    PAIRS: tl.constexpr, RADII: tl.constexpr, SPLIT: tl.constexpr,
 ):  # fmt: skip
     """The tile and the splat of each pair, splats in `order`; with SPLIT, the upper four of the splat's 32 bits are for
     the tile's quarters, row by row. Pairs beyond the last, and those that rounding has left without a tile, get a tile
@@ -150,13 +149,13 @@ def list_kernel(
     begin = tl.load(ends + low - 1, mask=low > 0, other=0)
     rows = tl.load(order + low)
     x, y, a, b, c, bound, det = _ellipse(means2d, conics, opacities, rows, valid)
-    left, top, right, bottom = _box(x, y, radii, rows, valid, width, height, SIDE, RADII)
+    left, top, right, bottom = _box(x, y, radii, rows, valid, width, height, RADII)
     left_over = tl.where(real, at - begin, -1).to(tl.int32)  # tiles of the splat before the pair's, in rows to come
     # Spread over a row: in a single tile, spare pairs would keep its threads busy for longer than the image takes.
     tile = width * height + at % width
     row = top
     while tl.max(tl.where(row < bottom, left_over, -1), axis=0) >= 0:
-        first, end = _columns(row, x, y, a, b, c, bound, det, left, right, SIDE)
+        first, end = _columns(row, x, y, a, b, c, bound, det, left, right, TILE)
         here = (left_over >= 0) & (left_over < end - first)
         tile = tl.where(here, row * width + first + left_over, tile)
         left_over = tl.where(here, -1, left_over - tl.where(left_over >= 0, end - first, 0))
@@ -165,7 +164,7 @@ def list_kernel(
     if SPLIT:
         for quarter in tl.static_range(4):
             row, column = tile // width * 2 + quarter // 2, tile % width * 2 + quarter % 2
-            first, end = _columns(row, x, y, a, b, c, bound, det, left * 2, right * 2, SIDE // 2)
+            first, end = _columns(row, x, y, a, b, c, bound, det, left * 2, right * 2, TILE // 2)
             rows |= ((first <= column) & (column < end)).to(tl.int32) << (quarter + 28)
     tl.store(tiles + at, (tile + FIRST).to(tl.int16), mask=valid)
     tl.store(splats + at, rows, mask=valid)
@@ -277,7 +276,6 @@ def tile_lists(
     opacities: Tensor,
     width: int,
     height: int,
-    side: int,
     room: Room | FixedRoom | None = None,
     split: bool = False,
 ) -> tuple[Tensor, Tensor]:
@@ -288,9 +286,8 @@ def tile_lists(
         radii: half the sides, in pixels, of the boxes that bound the splats: of squares [M] or of rectangles [M, 2].
         opacities: as composited, compensation included, [M].
         width, height: image size in tiles; with the row below, at most 2^16 that are not split.
-        side: side of a tile in pixels, `TILE_SIZE` or a part of it.
         room: makes room for its number of pairs and is sent the actual one; None: wait for the number.
-        split: list in tiles of twice the side, for which there is room, and split these lists.
+        split: tiles have half of gsplat's side: the lists of gsplat's tiles, for which there is room, are split.
 
     Returns:
         Where each tile's splats begin, int32 [1, height + 1, width], the last row for tiles below the image; rows of
@@ -298,14 +295,14 @@ def tile_lists(
         is not set, and not for gsplat's kernels, which would read it.
     """
     if split:
-        size, side, width, height = (width, height), 2 * side, -(-width // 2), -(-height // 2)
+        size, width, height = (width, height), -(-width // 2), -(-height // 2)
     count, device, axes = len(depths), depths.device, 1 if radii.dim() == 1 else 2
     order = torch.sort(depths, stable=True).indices
     counts = torch.empty(count, dtype=torch.int32, device=device)
     splats = means2d, conics, opacities, radii, order
     launch_count(
         (-(-count // SPLATS), 1, 1), *splats, counts, count, width, height,
-        SPLATS=SPLATS, SIDE=side, RADII=axes, num_warps=2,
+        SPLATS=SPLATS, RADII=axes, num_warps=2,
     )  # fmt: skip
     ends = counts.cumsum(0)
     if room is None:
@@ -317,7 +314,7 @@ def tile_lists(
     if pairs > 0:
         launch_list(
             (-(-pairs // PAIRS), 1, 1), *splats, ends, tiles, rows, count, pairs, width, height,
-            PAIRS=PAIRS, SIDE=side, RADII=axes, SPLIT=split, num_warps=4,
+            PAIRS=PAIRS, RADII=axes, SPLIT=split, num_warps=4,
         )  # fmt: skip
     tiles, by_tile = torch.sort(tiles, stable=True)
     numbers = torch.arange(FIRST.value, FIRST.value + width * (height + 1), dtype=torch.int16, device=device)
