@@ -14,8 +14,6 @@ compiled kernels raise.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from gsplat import fully_fused_projection, isect_offset_encode, isect_tiles, rasterize_to_pixels, spherical_harmonics
 from torch import Tensor
@@ -24,9 +22,6 @@ from nrfgs_ns.host import GSPLAT, gsplat_version
 from nrfgs_ns.kernels.trial import tried_once
 
 from . import EPS2D, TILE_SIZE, Projection, ProjectionOptions
-
-if TYPE_CHECKING:  # imports Triton
-    from .tile_lists import Room
 
 HAS_BATCHES = gsplat_version() >= (1, 5)
 if (installed := ".".join(map(str, gsplat_version()))) not in GSPLAT:
@@ -120,21 +115,14 @@ def composite(
     projection: Projection, colors: Tensor, opacities: Tensor, backgrounds: Tensor | None, absgrad: bool
 ) -> tuple[Tensor, Tensor, dict]:
     """Render [C, H, W, D] over backgrounds [C, D], alphas [C, H, W, 1], and gsplat's tile lists for `info`."""
-    room = None
-    ours = False
-    if len(opacities) > 0 and _kernels_take(projection, opacities):
-        from .tile_lists import room_on
-
-        room = room_on(opacities.device)
-        ours = torch.is_grad_enabled() and colors.shape[1] == 3 and _compositing_runs_on(colors.device)
+    listed = _kernels_take(projection, opacities)
+    ours = listed and torch.is_grad_enabled() and colors.shape[1] == 3 and _compositing_runs_on(colors.device)
     side = TILE_SIZE // 2 if ours else TILE_SIZE
     tables = projection.means2d, projection.conics, colors, opacities
     shape = projection.width, projection.height, side
-    while True:
-        lists = _lists(projection, opacities, side, room)
-        render, alphas = (_our_image if ours else _gsplats_image)(tables, backgrounds, shape, lists, absgrad)
-        if room is None or room.was_enough():
-            return render, alphas, {"isect_offsets": lists[0], "flatten_ids": lists[1], "tile_size": side}
+    lists = _lists(projection, opacities, side, by_gsplat=not listed)
+    render, alphas = (_our_image if ours else _gsplats_image)(tables, backgrounds, shape, lists, absgrad)
+    return render, alphas, {"isect_offsets": lists[0], "flatten_ids": lists[1], "tile_size": side}
 
 
 def _gsplats_image(
@@ -161,12 +149,12 @@ def _our_image(
     return CompositeSplats.apply(means2d, conics, opacities, colors, background, *lists, shape[:2], absgrad)
 
 
-def _lists(projection: Projection, opacities: Tensor, side: int, room: Room | None) -> tuple[Tensor, Tensor]:
+def _lists(projection: Projection, opacities: Tensor, side: int, by_gsplat: bool) -> tuple[Tensor, Tensor]:
     """Offsets into a list of rows, and the list: the splats that each tile draws, as the compositing kernels take them.
 
     Args:
         side: of a tile, in pixels; for our compositing half of gsplat's.
-        room: for the kernels of `tile_lists.py`; None: gsplat makes the lists.
+        by_gsplat: gsplat makes the lists, not the kernels of `tile_lists.py`.
     """
     tile_width, tile_height = -(-projection.width // side), -(-projection.height // side)
     bounds = projection.radii
@@ -174,11 +162,11 @@ def _lists(projection: Projection, opacities: Tensor, side: int, room: Room | No
         extents = projection.extents  # a square where another device has projected them
         bounds = projection.radii[:, None].expand(-1, 2) if extents is None else extents
     means2d, depths, conics = projection.means2d, projection.depths, projection.conics
-    if room is not None:
+    if not by_gsplat:
         from .tile_lists import tile_lists
 
         tables = (table.detach().contiguous() for table in (means2d, bounds, depths, conics, opacities))
-        return tile_lists(*tables, tile_width, tile_height, room, split=side < TILE_SIZE)
+        return tile_lists(*tables, tile_width, tile_height, split=side < TILE_SIZE)
     images = {"n_cameras": projection.n_cameras, "camera_ids": projection.camera_ids}
     if HAS_BATCHES:
         images = {"n_images": projection.n_cameras, "image_ids": projection.camera_ids}
@@ -189,10 +177,11 @@ def _lists(projection: Projection, opacities: Tensor, side: int, room: Room | No
 
 
 def _kernels_take(projection: Projection, opacities: Tensor) -> bool:
-    """Whether the kernels of `tile_lists.py` make the lists."""
+    """Whether the kernels of `tile_lists.py` make the lists, of at least one splat."""
     tiles = -(-projection.width // TILE_SIZE) * (-(-projection.height // TILE_SIZE) + 1)  # with the row below the image
     return (
         projection.n_cameras == 1
+        and len(opacities) > 0
         and tiles <= MOST_TILES
         and opacities.dtype == projection.means2d.dtype == torch.float32
         and _kernels_run_on(opacities.device)

@@ -197,75 +197,40 @@ def split_kernel(begins, splats, places, lists, width, height, BATCH: tl.constex
 launch_count, launch_list, launch_split = Launcher(count_kernel), Launcher(list_kernel), Launcher(split_kernel)
 
 
-MORE = 1.25
-"""Room for each recent pair."""
-KEPT = 0.99
-"""Share of the room that remains for the next image, if it needs less."""
-_ROOMS = threading.local()  # by device; a viewer's thread draws other images than a training's
+class _Thread(threading.local):
+    """What a thread has of its own: a viewer's draws other images than a training's."""
+
+    room: Room | None = None
+
+
+_thread = _Thread()
 
 
 class Room:
-    """Room on a GPU for the pairs of splats and tiles of an image.
+    """Constant room for `pairs` of splats and tiles on a device, for a CUDA graph.
 
-    Only the GPU knows how many pairs an image has, and asking it first would leave it idle. So the host makes room for
-    a little more than in recent images, goes on, and checks whether that was enough once the image is on its way.
+    Only the GPU knows how many pairs an image has, and a graph cannot wait for the number: its owner checks it after
+    the graph has run.
     """
-
-    def __init__(self):
-        self.pairs = 0
-        with torch.inference_mode(False):  # it outlives a rendering that records nothing
-            self._counted = torch.empty(1, dtype=torch.int64, pin_memory=True)
-        self._arrived = torch.cuda.Event()
-
-    def send(self, total: Tensor) -> None:
-        """Send the number of pairs [1] to the host."""
-        self._counted.copy_(total, non_blocking=True)
-        self._arrived.record()
-
-    def was_enough(self) -> bool:
-        """Whether there was room for all pairs; makes room for them and for the next image. Waits for the number."""
-        self._arrived.synchronize()
-        room = self.pairs
-        pairs = int(self._counted[0])
-        self.pairs = max(int(MORE * pairs), int(KEPT * room))
-        return pairs <= room
-
-
-class FixedRoom:
-    """Constant room for `pairs` on a device, for a CUDA graph; its owner checks it after the graph has run."""
 
     def __init__(self, pairs: int, device: torch.device):
         self.pairs = pairs
         self.counted = torch.full((2,), -1, dtype=torch.int64, device=device)
         """pairs of the last image, and the most of any; -1 before the first"""
 
-    def send(self, total: Tensor) -> None:
-        """Keep the number of pairs [1], on the GPU."""
+    def keep(self, total: Tensor) -> None:
+        """Keep an image's number of pairs [1], on the GPU."""
         self.counted[:1].copy_(total)
         torch.maximum(self.counted[1:], total, out=self.counted[1:])
-
-    def was_enough(self) -> bool:
-        return True
 
     @contextmanager
     def in_use(self) -> Iterator[None]:
         """Use this room for the images of this thread."""
-        rooms = _ROOMS.__dict__
-        device = self.counted.device
-        usual = rooms.get(device)
-        rooms[device] = self
+        _thread.room = self
         try:
             yield
         finally:
-            rooms[device] = usual
-
-
-def room_on(device: torch.device) -> Room | FixedRoom:
-    """The room on a GPU for the images of this thread."""
-    rooms = _ROOMS.__dict__
-    if rooms.get(device) is None:
-        rooms[device] = Room()
-    return rooms[device]
+            _thread.room = None
 
 
 def tile_lists(
@@ -276,17 +241,15 @@ def tile_lists(
     opacities: Tensor,
     width: int,
     height: int,
-    room: Room | FixedRoom | None = None,
     split: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """Lists of one camera's tiles. All tensors are contiguous.
+    """Lists of one camera's tiles, in the thread's `Room` if one is in use. All tensors are contiguous.
 
     Args:
         means2d, depths, conics: a `Projection`'s, M >= 1 rows; if split, fewer than 2^28.
         radii: half the sides, in pixels, of the boxes that bound the splats: of squares [M] or of rectangles [M, 2].
         opacities: as composited, compensation included, [M].
         width, height: image size in tiles; with the row below, at most 2^16 that are not split.
-        room: makes room for its number of pairs and is sent the actual one; None: wait for the number.
         split: tiles have half of gsplat's side: the lists of gsplat's tiles, for which there is room, are split.
 
     Returns:
@@ -305,11 +268,11 @@ def tile_lists(
         SPLATS=SPLATS, RADII=axes, num_warps=2,
     )  # fmt: skip
     ends = counts.cumsum(0)
-    if room is None:
+    if _thread.room is None:
         pairs = int(ends[-1])
     else:
-        room.send(ends[-1:])
-        pairs = room.pairs
+        _thread.room.keep(ends[-1:])
+        pairs = _thread.room.pairs
     tiles, rows = (torch.empty(pairs, dtype=dtype, device=device) for dtype in (torch.int16, torch.int32))
     if pairs > 0:
         launch_list(

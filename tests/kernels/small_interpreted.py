@@ -20,7 +20,7 @@ from nrfgs_ns.densification.statistics_triton import in_triton
 from nrfgs_ns.image import ssim_triton
 from nrfgs_ns.image.ssim import photometric_loss
 from nrfgs_ns.rasterizer import TILE_SIZE, gsplat_cuda
-from nrfgs_ns.rasterizer.tile_lists import FixedRoom, tile_lists
+from nrfgs_ns.rasterizer.tile_lists import Room, tile_lists
 
 
 # The loss, against pytorch_msssim in float64. A row of a program takes about a tenth of a second, hence small images.
@@ -79,7 +79,8 @@ def test_split_lists_are_those_of_tiles_of_their_size(monkeypatch):
     """Split in batches that end inside of a tile's list, and with room to spare."""
     monkeypatch.setattr("nrfgs_ns.rasterizer.tile_lists.BATCH", 16)
     of = splats(200, 100, 70)
-    begins, rows = tile_lists(*of, 13, 9, FixedRoom(2000, torch.device("cpu")), split=True)
+    with Room(2000, torch.device("cpu")).in_use():
+        begins, rows = tile_lists(*of, 13, 9, split=True)
     listed = rows[: begins[0, -1, 0]]
     assert assert_lists(begins, listed, of, 13, 9, TILE_SIZE // 2) <= 0.1 * len(listed)
 
@@ -122,7 +123,7 @@ def test_what_is_not_finite_is_listed_and_shows():
 @pytest.fixture
 def ours(monkeypatch):
     draw_with_our_kernels(monkeypatch, "cpu")
-    with FixedRoom(2000, torch.device("cpu")).in_use():
+    with Room(2000, torch.device("cpu")).in_use():
         yield
 
 
