@@ -167,7 +167,7 @@ def _constants(packing: Packing, launch: Launch, config, one_center: bool) -> di
         "B": launch.block,
         "COLUMNS": launch.columns,
         "ONE_CENTER": one_center,
-        "BOUND": config.bound if config.opacity_residual else "none",
+        "BOUND": config.bound,
         "KIND": KINDS[config.precision][0],
         **launch.options(packing.hidden),
     }
