@@ -32,6 +32,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nrfgs_ns.kernels.launch import Launcher
+from nrfgs_ns.kernels.tables import load_rows
 
 BLOCK = tl.constexpr(8)
 """Side of a tile in pixels."""
@@ -45,15 +46,6 @@ LN_2 = tl.constexpr(0.6931471805599453)
 MAX_ALPHA = tl.constexpr(0.999)
 MIN_ALPHA = tl.constexpr(1.0 / 255.0)
 MIN_TRANSMITTANCE = tl.constexpr(1e-4)
-
-
-@triton.jit
-def _rows(table, rows, valid, SIZE: tl.constexpr):
-    """Columns of some rows of a table [.., SIZE]."""
-    columns = ()
-    for i in tl.static_range(SIZE):
-        columns += (tl.load(table + rows * SIZE + i, mask=valid, other=0.0),)
-    return columns
 
 
 @triton.jit
@@ -92,13 +84,13 @@ def _batch(ids, at, end, column, means2d, conics, opacities, colors):
         place = at + tl.arange(0, LANES)[None, :] * EACH + k
         valid = place < end
         splat = tl.load(ids + place, mask=valid, other=0)
-        x, y = _rows(means2d, splat, valid, 2)
-        a, b, c = _rows(conics, splat, valid, 3)
+        x, y = load_rows(means2d, splat, valid, 2)
+        a, b, c = load_rows(conics, splat, valid, 3)
         a, b, c = a * (-0.5 * LOG2_E), b * -LOG2_E, c * (-0.5 * LOG2_E)
         dx = x - (column.to(tl.float32) + 0.5)
         opacity = tl.load(opacities + splat, mask=valid, other=0.0)
         peak = tl.where(opacity <= 0.0, -float("inf"), tl.log2(opacity))
-        splats += ((splat, dx, a * dx, b, c, y, peak, _rows(colors, splat, valid, 3)),)
+        splats += ((splat, dx, a * dx, b, c, y, peak, load_rows(colors, splat, valid, 3)),)
     return splats
 
 
@@ -179,7 +171,7 @@ def backward_kernel(
     left, worth = (), ()  # T and R of the block's rows, the next one's first
     for step in tl.static_range(BLOCK):
         pixel, inside = _pixels(top + step, column, width, height)
-        upstream, rgb = _rows(d_render, pixel, inside, 3), _rows(render, pixel, inside, 3)
+        upstream, rgb = load_rows(d_render, pixel, inside, 3), load_rows(render, pixel, inside, 3)
         value = tl.load(alphas + pixel, mask=inside, other=0.0) - 1.0
         value *= tl.load(d_alphas + pixel, mask=inside, other=0.0)
         for i in tl.static_range(3):
@@ -193,7 +185,7 @@ def backward_kernel(
             sums += ((none, none, none, none, none, none, none, none),)
         for row in range(BLOCK):
             pixel, inside = _pixels(top + row, column, width, height)
-            red, green, blue = _rows(d_render, pixel, inside, 3)
+            red, green, blue = load_rows(d_render, pixel, inside, 3)
             shown, drawn, weights, last, new_left = _blend(splats, top + row, left[0])
             gains, total = (), none
             for k in tl.static_range(EACH):
