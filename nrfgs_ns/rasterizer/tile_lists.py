@@ -195,13 +195,8 @@ def split_kernel(begins, splats, places, lists, width, height, BATCH: tl.constex
 launch_count, launch_list, launch_split = Launcher(count_kernel), Launcher(list_kernel), Launcher(split_kernel)
 
 
-class _Thread(threading.local):
-    """What a thread has of its own: a viewer's draws other images than a training's."""
-
-    room: Room | None = None
-
-
-_thread = _Thread()
+_THREAD = threading.local()
+"""`room`, where one is in use: a viewer's thread draws other images than a training's."""
 
 
 class Room:
@@ -224,11 +219,11 @@ class Room:
     @contextmanager
     def in_use(self) -> Iterator[None]:
         """Use this room for the images of this thread."""
-        _thread.room = self
+        _THREAD.room = self
         try:
             yield
         finally:
-            _thread.room = None
+            del _THREAD.room
 
 
 def tile_lists(
@@ -266,11 +261,12 @@ def tile_lists(
         SPLATS=SPLATS, RADII=axes, num_warps=2,
     )  # fmt: skip
     ends = counts.cumsum(0)
-    if _thread.room is None:
+    room = getattr(_THREAD, "room", None)
+    if room is None:
         pairs = int(ends[-1])
     else:
-        _thread.room.keep(ends[-1:])
-        pairs = _thread.room.pairs
+        room.keep(ends[-1:])
+        pairs = room.pairs
     tiles, rows = (torch.empty(pairs, dtype=dtype, device=device) for dtype in (torch.int16, torch.int32))
     if pairs > 0:
         launch_list(
