@@ -6,6 +6,7 @@ unit direction d = v / |v|; v's gradient is the part of d's that is orthogonal t
 """
 
 import math
+from typing import Any
 
 import torch
 import triton
@@ -13,7 +14,6 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nrfgs_ns.kernels.launch import Launcher
 from nrfgs_ns.kernels.tables import load_rows, store_rows
 
 BLOCK = 128
@@ -121,9 +121,6 @@ def backward_kernel(
     store_rows(d_directions, at, across, valid, 3)
 
 
-launch_forward, launch_backward = Launcher(forward_kernel), Launcher(backward_kernel)
-
-
 class Harmonics(torch.autograd.Function):
     """(degree, directions [M, 3], coefficients [M, B, 3]) -> [M, 3]; float32, as `eval_sh` says."""
 
@@ -133,7 +130,7 @@ class Harmonics(torch.autograd.Function):
         ctx.save_for_backward(directions, coefficients)
         ctx.used = (degree + 1) ** 2
         colors = torch.empty_like(directions)
-        _launch(launch_forward, ctx.used, directions, coefficients, colors)
+        _launch(forward_kernel, ctx.used, directions, coefficients, colors)
         return colors
 
     @staticmethod
@@ -141,12 +138,12 @@ class Harmonics(torch.autograd.Function):
     def backward(ctx, d_colors: Tensor) -> tuple[None, Tensor, Tensor]:
         directions, coefficients = ctx.saved_tensors
         gradients = torch.empty_like(directions), torch.empty_like(coefficients)
-        _launch(launch_backward, ctx.used, directions, coefficients, d_colors.contiguous(), *gradients)
+        _launch(backward_kernel, ctx.used, directions, coefficients, d_colors.contiguous(), *gradients)
         return None, *gradients
 
 
-def _launch(kernel: Launcher, used: int, directions: Tensor, coefficients: Tensor, *others: Tensor) -> None:
+def _launch(kernel: Any, used: int, directions: Tensor, coefficients: Tensor, *others: Tensor) -> None:
     count, bases = coefficients.shape[:2]
     if count > 0:
-        grid = -(-count // BLOCK), 1, 1
-        kernel(grid, directions, coefficients, *others, count, USED=used, BASES=bases, BLOCK=BLOCK, num_warps=WARPS)
+        grid = (-(-count // BLOCK),)
+        kernel[grid](directions, coefficients, *others, count, USED=used, BASES=bases, BLOCK=BLOCK, num_warps=WARPS)

@@ -7,7 +7,6 @@ import triton.language as tl
 from torch import Tensor
 
 from nrfgs_ns.densification.statistics import Statistics, Step
-from nrfgs_ns.kernels.launch import Launcher
 
 BLOCK = 256
 """Rows that a program takes; a power of two."""
@@ -44,9 +43,6 @@ def statistics_kernel(
         tl.store(changes + row, tl.where(new > old, new, old), mask=valid)  # NaN is not greater
 
 
-launch = Launcher(statistics_kernel)
-
-
 def in_triton(tables: Statistics, step: Step, gradients: Tensor | None, change: Tensor | None) -> None:
     """`statistics.in_torch` for dense float32 tensors and rows that are all different."""
     count = len(step.rows)
@@ -55,7 +51,7 @@ def in_triton(tables: Statistics, step: Step, gradients: Tensor | None, change: 
         arguments = *tables, step.rows, step.radii.contiguous(), gradients, change
         arguments = (written[0] if value is None else value for value in arguments)  # a pointer that is not used
         wanted = {name.upper(): table is not None for name, table in tables._asdict().items()}
-        grid = -(-count // BLOCK), 1, 1
-        launch(grid, *arguments, count, *step.scales, 1 / step.side, BLOCK=BLOCK, **wanted, num_warps=4)
+        grid = (-(-count // BLOCK),)
+        statistics_kernel[grid](*arguments, count, *step.scales, 1 / step.side, BLOCK=BLOCK, **wanted, num_warps=4)
         for table in written:
             torch.autograd.graph.increment_version(table)

@@ -16,7 +16,6 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nrfgs_ns.image import metrics
-from nrfgs_ns.kernels.launch import Launcher
 
 COLUMNS = 128
 """Numbers of a row that a program takes; a power of two."""
@@ -166,9 +165,6 @@ def backward_kernel(
             tl.store(d_prediction + at, gradient, mask=here)
 
 
-launch_forward, launch_backward = Launcher(forward_kernel), Launcher(backward_kernel)
-
-
 class WeightedSum(torch.autograd.Function):
     """l1_weight mean |prediction - truth| + ssim_weight SSIM + constant, of float32 images [H, W, 3] at least as large
     as the window. A training step is bound by the host: one kernel and one sum forward, one kernel backward."""
@@ -180,12 +176,12 @@ class WeightedSum(torch.autograd.Function):
         border = metrics.WINDOW_SIZE - 1
         l1_scale = l1_weight / (height * width)
         ssim_scale = ssim_weight / ((height - border) * (width - 3 * border))
-        grid = (-(-width // COLUMNS), -(-height // ROWS), 1)
+        grid = -(-width // COLUMNS), -(-height // ROWS)
         wanted = ctx.needs_input_grad[0]
         slopes = prediction.new_empty(3 * height * width if wanted else 0)
         partials = prediction.new_empty(grid[0] * grid[1])
-        launch_forward(
-            grid, prediction, truth, slopes, partials, height, width, l1_scale, ssim_scale, constant,
+        forward_kernel[grid](
+            prediction, truth, slopes, partials, height, width, l1_scale, ssim_scale, constant,
             COLUMNS=COLUMNS, ROWS=ROWS, SLOPES=wanted, num_warps=WARPS,
         )  # fmt: skip
         ctx.save_for_backward(prediction, truth, slopes)
@@ -198,8 +194,8 @@ class WeightedSum(torch.autograd.Function):
         prediction, truth, slopes = ctx.saved_tensors
         height, width = prediction.shape[0], 3 * prediction.shape[1]
         d_prediction = torch.empty_like(prediction)
-        launch_backward(
-            ctx.grid, prediction, truth, slopes, d_loss, d_prediction, height, width, *ctx.scales,
+        backward_kernel[ctx.grid](
+            prediction, truth, slopes, d_loss, d_prediction, height, width, *ctx.scales,
             COLUMNS=COLUMNS, ROWS=ROWS, num_warps=WARPS,
         )  # fmt: skip
         return d_prediction, None, None, None, None

@@ -31,7 +31,6 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nrfgs_ns.kernels.launch import Launcher
 from nrfgs_ns.kernels.tables import load_rows
 
 BLOCK = tl.constexpr(8)
@@ -223,9 +222,6 @@ def backward_kernel(
                 _add(absgrad, splat, (abs_x * LN_2, abs_y * LN_2), 2)
 
 
-launch_forward, launch_backward = Launcher(forward_kernel), Launcher(backward_kernel)
-
-
 class CompositeSplats(torch.autograd.Function):
     """(means2d, conics, opacities, colors, background [1, 3]) -> (render [1, H, W, 3], alphas [1, H, W, 1]).
 
@@ -236,11 +232,11 @@ class CompositeSplats(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means2d, conics, opacities, colors, background, begins, ids, shape: tuple, absgrad: bool):
         width, height = ctx.shape = shape
-        ctx.absgrad, ctx.grid = absgrad, (begins.shape[2], begins.shape[1] - 1, 1)
+        ctx.absgrad, ctx.grid = absgrad, (begins.shape[2], begins.shape[1] - 1)
         render, alphas = means2d.new_empty(1, height, width, 3), means2d.new_empty(1, height, width, 1)
         tables = begins, ids, means2d, conics, opacities, colors
         results = render, alphas, ids.new_empty(ctx.grid[0] * ctx.grid[1])
-        launch_forward(ctx.grid, *tables, background, *results, *shape, num_warps=1)
+        forward_kernel[ctx.grid](*tables, background, *results, *shape, num_warps=1)
         ctx.save_for_backward(*tables, *results)
         return render, alphas
 
@@ -251,7 +247,7 @@ class CompositeSplats(torch.autograd.Function):
         gradients = [torch.zeros_like(table) for table in tables]
         absgrad = torch.zeros_like(tables[0]) if ctx.absgrad else alphas
         arguments = *saved, d_render.contiguous(), d_alphas.contiguous(), *gradients, absgrad, *ctx.shape
-        launch_backward(ctx.grid, *arguments, ABSGRAD=ctx.absgrad, num_warps=1)
+        backward_kernel[ctx.grid](*arguments, ABSGRAD=ctx.absgrad, num_warps=1)
         if ctx.absgrad:
             tables[0].absgrad = absgrad
         background = ((1.0 - alphas) * d_render).sum((1, 2)) if ctx.needs_input_grad[4] else None

@@ -28,7 +28,6 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from nrfgs_ns.kernels.launch import Launcher
 from nrfgs_ns.kernels.tables import load_rows
 
 from . import TILE_SIZE
@@ -192,9 +191,6 @@ def split_kernel(begins, splats, places, lists, width, height, BATCH: tl.constex
         tl.store(places + 1, place, mask=inside)
 
 
-launch_count, launch_list, launch_split = Launcher(count_kernel), Launcher(list_kernel), Launcher(split_kernel)
-
-
 _THREAD = threading.local()
 """`room`, where one is in use: a viewer's thread draws other images than a training's."""
 
@@ -256,10 +252,8 @@ def tile_lists(
     order = torch.sort(depths, stable=True).indices
     counts = torch.empty(count, dtype=torch.int32, device=device)
     splats = means2d, conics, opacities, radii, order
-    launch_count(
-        (-(-count // SPLATS), 1, 1), *splats, counts, count, width, height,
-        SPLATS=SPLATS, RADII=axes, num_warps=2,
-    )  # fmt: skip
+    grid = (-(-count // SPLATS),)
+    count_kernel[grid](*splats, counts, count, width, height, SPLATS=SPLATS, RADII=axes, num_warps=2)
     ends = counts.cumsum(0)
     room = getattr(_THREAD, "room", None)
     if room is None:
@@ -269,8 +263,8 @@ def tile_lists(
         pairs = room.pairs
     tiles, rows = (torch.empty(pairs, dtype=dtype, device=device) for dtype in (torch.int16, torch.int32))
     if pairs > 0:
-        launch_list(
-            (-(-pairs // PAIRS), 1, 1), *splats, ends, tiles, rows, count, pairs, width, height,
+        list_kernel[(-(-pairs // PAIRS),)](
+            *splats, ends, tiles, rows, count, pairs, width, height,
             PAIRS=PAIRS, RADII=axes, SPLIT=split, num_warps=4,
         )  # fmt: skip
     tiles, by_tile = torch.sort(tiles, stable=True)
@@ -281,7 +275,7 @@ def tile_lists(
         return begins.view(1, height + 1, width), rows
     places = rows.new_zeros(size[1] + 1, size[0])
     lists = rows.new_empty(4 * pairs)
-    launch_split((width, height, 1), begins, rows, places, lists, *size, BATCH=BATCH, COUNT=True, num_warps=2)
+    split_kernel[(width, height)](begins, rows, places, lists, *size, BATCH=BATCH, COUNT=True, num_warps=2)
     places = places.flatten().cumsum(0, dtype=torch.int32).view(1, *places.shape)
-    launch_split((width, height, 1), begins, rows, places, lists, *size, BATCH=BATCH, COUNT=False, num_warps=2)
+    split_kernel[(width, height)](begins, rows, places, lists, *size, BATCH=BATCH, COUNT=False, num_warps=2)
     return places, lists

@@ -18,9 +18,6 @@ from nrfgs_ns.appearance.fused.kernels import backward_kernel, forward_kernel
 from nrfgs_ns.appearance.fused.packing import CENTER_SLOTS, Packing
 from nrfgs_ns.appearance.fused.tiles import INTERPRETED
 from nrfgs_ns.appearance.head import SH_C0
-from nrfgs_ns.kernels.launch import Launcher
-
-launch_forward, launch_backward = Launcher(forward_kernel), Launcher(backward_kernel)
 
 
 class Launch(NamedTuple):
@@ -113,8 +110,8 @@ class FusedFunction(torch.autograd.Function):
         eps_squared = (config.distance_eps * scene_unit) ** 2
         scalars = eps_squared, math.log(scene_unit), config.color_scale, config.opacity_scale, SH_C0
         if count > 0:
-            launch_forward(
-                (_programs(launch, count, visible.device), 1, 1), *tables, visible, centers, packed, *outputs,
+            forward_kernel[(_programs(launch, count, visible.device),)](
+                *tables, visible, centers, packed, *outputs,
                 count, *scalars, **_constants(packing, launch, config, centers.dim() == 1),
             )  # fmt: skip
         ctx.save_for_backward(*tables, visible, centers, packed)
@@ -135,8 +132,8 @@ class FusedFunction(torch.autograd.Function):
         if count > 0:
             programs = _programs(launch, count, visible.device)
             partials = tables[0].new_empty(programs, len(packing.gather) + CENTER_SLOTS)
-            launch_backward(
-                (programs, 1, 1), *tables, visible, centers, packed,
+            backward_kernel[(programs,)](
+                *tables, visible, centers, packed,
                 _contiguous(d_colors), _contiguous(d_opacities), *d_tables, d_centers, partials,
                 count, *ctx.scalars, SLOTS=partials.shape[1], CENTER=wants_center,
                 GRADIENT_KIND=KINDS[config.precision][1], **_constants(packing, launch, config, one_center),
