@@ -105,7 +105,7 @@ class NrfConfig(AppearanceHeadConfig):
         self.require(self.distance_eps > 0, "distance_eps", "positive")
         hints = get_type_hints(NrfConfig)
         choices_of = {name: get_args(hints[name]) for name in ("output_init", "implementation", "precision")}
-        choices_of["implementation"] += ("fused",)  # in files of 0.2; now the same as auto
+        choices_of["implementation"] += ("fused",)  # in what 0.2.0 has saved: the same as auto
         choices_of["opacity_bound"] = None, *OPACITY_BOUNDS
         for name, choices in choices_of.items():
             self.require(getattr(self, name) in choices, name, "one of " + ", ".join(map(repr, choices)))
