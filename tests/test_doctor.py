@@ -12,7 +12,7 @@ import torch
 from nrfgs_ns import doctor
 from nrfgs_ns.densification import statistics
 from nrfgs_ns.image import ssim
-from nrfgs_ns.kernels.trial import Gate
+from nrfgs_ns.kernels.trial import tried_once
 from nrfgs_ns.training import optimizers, pipeline
 
 DECLARED = {
@@ -87,7 +87,7 @@ def test_kernels_that_fail_are_told_apart(monkeypatch):
     monkeypatch.setattr("nrfgs_ns.appearance.nrf.NeuralResidualField.try_kernels", lambda *_: None)
     assert [(finding.fix, finding.broken) for finding in doctor.kernels(CPU)] == [("", False)] * 2
     trial = Mock(side_effect=OSError("no compiler"))
-    monkeypatch.setattr(ssim, "kernels_run_on", lambda device: Gate("SSIM").opens(device, device, trial))
+    monkeypatch.setattr(ssim, "kernels_run_on", tried_once("SSIM")(trial))
     gsplat, triton = doctor.kernels(CPU)
     assert not gsplat.fix and not triton.broken and "SSIM" in triton.fix and "no compiler" in triton.fix
     monkeypatch.setattr(pipeline, "load_kernels", Mock(side_effect=ImportError("no nvcc")))

@@ -130,7 +130,7 @@ def eval_sh(degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
 
 
 @tried_once("Spherical harmonics")
-def kernels_run_on(device: torch.device) -> None:
+def kernels_run_on(device: torch.device) -> bool:
     """Whether Triton's kernels run on a CUDA device."""
     from nrfgs_ns.appearance.harmonics_triton import Harmonics
 
@@ -138,3 +138,4 @@ def kernels_run_on(device: torch.device) -> None:
     coefficients = torch.ones(1, 16, 3, device=device, requires_grad=True)
     for degree in range(4):
         Harmonics.apply(degree, direction, coefficients).sum().backward()
+    return True

@@ -65,7 +65,7 @@ def in_torch(
 
 
 @tried_once("What densification remembers")
-def try_kernel(device: torch.device) -> None:
+def try_kernel(device: torch.device) -> bool:
     """Whether the kernel runs on a CUDA device; the first step would compile it."""
     from nrfgs_ns.densification.statistics_triton import in_triton
 
@@ -74,3 +74,4 @@ def try_kernel(device: torch.device) -> None:
     info |= {"width": 1, "height": 1}
     for norms, counts in ((one.clone(), one.clone()), (one.clone(), None), (None, None)):  # after growth no norms
         in_triton(Statistics(one, norms, counts), info, (1.0, 1.0), gradient)
+    return True

@@ -10,7 +10,6 @@ import triton.language as tl
 from torch import Tensor
 
 from nrfgs_ns.densification.statistics import Statistics
-from nrfgs_ns.kernels.launch import Launcher
 
 BLOCK = 256
 """Rows that a program takes; a power of two."""
@@ -43,9 +42,6 @@ def statistics_kernel(
         tl.store(counts + row, tl.load(counts + row, mask=valid, other=0.0) + 1.0, mask=valid)
 
 
-launch = Launcher(statistics_kernel)
-
-
 def in_triton(
     tables: Statistics, info: Mapping[str, Any], scales: tuple[float, float], gradients: Tensor | None
 ) -> None:
@@ -56,8 +52,8 @@ def in_triton(
         arguments = *tables, info["gaussian_ids"], info["radii"].contiguous(), gradients
         arguments = (written[0] if value is None else value for value in arguments)  # a pointer that is not used
         wanted = {name.upper(): table is not None for name, table in tables._asdict().items()}
-        grid = -(-count // BLOCK), 1, 1
+        grid = (-(-count // BLOCK),)
         radius_scale = 1 / float(max(info["width"], info["height"]))
-        launch(grid, *arguments, count, *scales, radius_scale, BLOCK=BLOCK, **wanted, num_warps=4)
+        statistics_kernel[grid](*arguments, count, *scales, radius_scale, BLOCK=BLOCK, **wanted, num_warps=4)
         for table in written:
             torch.autograd.graph.increment_version(table)

@@ -55,7 +55,8 @@ class PhotographModel(nn.Module):
     def forward(self, image: Tensor, index: int) -> Tensor:
         """The image [H, W, 3], in the mean look and not clamped, as the photograph exposed it; in [0, 1]."""
         # No matrix product: a recorded step would hold cuBLAS's memory by its address, which PyTorch may give back.
-        return with_gain(image, (self.exponents * self.shots[index]).sum(dim=-1).exp2()).clamp(0.0, 1.0)
+        gain = (self.exponents * self.shots[index]).sum(dim=-1).exp2()
+        return torch.addcmul(gain * TOE - TOE, image, gain).clamp(0.0, 1.0)
 
     @torch.no_grad()
     def center_(self) -> None:
@@ -81,14 +82,3 @@ class PhotographModel(nn.Module):
             if (patterns := state_dict.get(prefix + name)) is not None:
                 setattr(self, name, torch.empty_like(patterns, device=self.shots.device))
         super()._load_from_state_dict(state_dict, prefix, *args)
-
-
-def with_gain(image: Tensor, gain: Tensor) -> Tensor:
-    """Multiply the light of an image [H, W, 3] by gain^GAMMA under sRGB's curve; gain [3] or [H, W, 3]."""
-    return torch.addcmul(gain * TOE - TOE, image, gain)
-
-
-def exposed(image: Tensor, stops: float | Tensor) -> Tensor:
-    """Expose an image [H, W, 3] by more stops, one number or one for each channel [3]; clamped to [0, 1]."""
-    gain = torch.exp2(torch.as_tensor(stops, dtype=image.dtype, device=image.device) / GAMMA)
-    return with_gain(image, gain).clamp(0.0, 1.0)

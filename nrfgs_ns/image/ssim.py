@@ -19,9 +19,6 @@ from torch.autograd.function import once_differentiable
 from nrfgs_ns.image.metrics import LIBRARY, SSIM_C1, SSIM_C2, WEIGHTS, WINDOW_SIZE, blur
 from nrfgs_ns.kernels.trial import tried_once
 
-MAX_NUMBERS = 2**31
-"""The kernels index slopes with 32 bits: three slopes of an image must have fewer numbers."""
-
 
 def photometric_loss(prediction: Tensor, truth: Tensor, ssim_lambda: float) -> Tensor:
     """(1 - ssim_lambda) mean |prediction - truth| + ssim_lambda (1 - SSIM), a scalar; ssim_lambda in [0, 1].
@@ -31,12 +28,7 @@ def photometric_loss(prediction: Tensor, truth: Tensor, ssim_lambda: float) -> T
     """
     if min(prediction.shape[:2]) < WINDOW_SIZE:
         similarity = LIBRARY(prediction.permute(2, 0, 1)[None], truth.permute(2, 0, 1)[None])
-    elif (
-        prediction.is_cuda
-        and prediction.dtype == torch.float32
-        and 3 * prediction.numel() < MAX_NUMBERS
-        and kernels_run_on(prediction.device)
-    ):
+    elif prediction.is_cuda and prediction.dtype == torch.float32 and kernels_run_on(prediction.device):
         from nrfgs_ns.image.ssim_triton import WeightedSum
 
         return WeightedSum.apply(prediction, truth, 1.0 - ssim_lambda, -ssim_lambda, ssim_lambda)
@@ -81,9 +73,10 @@ def _similarity(x: Tensor, y: Tensor, xx: Tensor, yy: Tensor, xy: Tensor) -> tup
 
 
 @tried_once("SSIM")
-def kernels_run_on(device: torch.device) -> None:
+def kernels_run_on(device: torch.device) -> bool:
     """Whether Triton's kernels run on a CUDA device."""
     from nrfgs_ns.image.ssim_triton import WeightedSum
 
     image = torch.zeros(WINDOW_SIZE, WINDOW_SIZE, 3, device=device, requires_grad=True)
     WeightedSum.apply(image, torch.zeros_like(image), 0.5, 0.5, 0.0).backward()
+    return True

@@ -16,7 +16,6 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nrfgs_ns.image import metrics
-from nrfgs_ns.kernels.launch import Launcher
 
 COLUMNS = 128
 """Numbers of a row that a program takes; a power of two."""
@@ -37,19 +36,12 @@ W0, W1, W2, W3, W4, W5 = (tl.constexpr(weight) for weight in metrics.WEIGHTS[:6]
 @triton.jit
 def _taps(row, columns, width):
     """The 11 numbers under the window along a row, a tuple of tiles; zero beyond columns 0..width - 1."""
-    return (
-        tl.load(row + columns - 15, mask=(columns >= 15) & (columns < width), other=0.0),
-        tl.load(row + columns - 12, mask=(columns >= 12) & (columns < width), other=0.0),
-        tl.load(row + columns - 9, mask=(columns >= 9) & (columns < width), other=0.0),
-        tl.load(row + columns - 6, mask=(columns >= 6) & (columns < width), other=0.0),
-        tl.load(row + columns - 3, mask=(columns >= 3) & (columns < width), other=0.0),
-        tl.load(row + columns, mask=columns < width, other=0.0),
-        tl.load(row + columns + 3, mask=columns < width - 3, other=0.0),
-        tl.load(row + columns + 6, mask=columns < width - 6, other=0.0),
-        tl.load(row + columns + 9, mask=columns < width - 9, other=0.0),
-        tl.load(row + columns + 12, mask=columns < width - 12, other=0.0),
-        tl.load(row + columns + 15, mask=columns < width - 15, other=0.0),
-    )
+    taps = ()
+    for tap in tl.static_range(SIZE):
+        shift = CHANNELS * (tap - REACH)
+        inside = (columns >= -shift) & (columns < width - shift)
+        taps = taps + (tl.load(row + columns + shift, mask=inside, other=0.0),)
+    return taps
 
 
 @triton.jit
@@ -70,8 +62,7 @@ def _blur_products(s, t):
 @triton.jit
 def _no_windows(COLUMNS: tl.constexpr):
     """Ten empty windows."""
-    zero = tl.zeros((COLUMNS,), tl.float32)
-    return zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
+    return (tl.zeros((COLUMNS,), tl.float32),) * 10
 
 
 @triton.jit
@@ -80,20 +71,11 @@ def _next_row(windows, row):
 
     Returns the complete sum of the oldest, and the ten that stay open.
     """
-    closed = windows[0] + row * W0
-    still_open = (
-        windows[1] + row * W1,
-        windows[2] + row * W2,
-        windows[3] + row * W3,
-        windows[4] + row * W4,
-        windows[5] + row * W5,
-        windows[6] + row * W4,
-        windows[7] + row * W3,
-        windows[8] + row * W2,
-        windows[9] + row * W1,
-        row * W0,
-    )
-    return closed, still_open
+    weights = (W0, W1, W2, W3, W4, W5, W4, W3, W2, W1)
+    still_open = ()
+    for i in tl.static_range(1, SIZE - 1):
+        still_open = still_open + (windows[i] + row * weights[i],)
+    return windows[0] + row * W0, still_open + (row * W0,)
 
 
 @triton.jit(do_not_specialize=["height", "width"])
@@ -183,9 +165,6 @@ def backward_kernel(
             tl.store(d_prediction + at, gradient, mask=here)
 
 
-launch_forward, launch_backward = Launcher(forward_kernel), Launcher(backward_kernel)
-
-
 class WeightedSum(torch.autograd.Function):
     """l1_weight mean |prediction - truth| + ssim_weight SSIM + constant, of float32 images [H, W, 3] at least as large
     as the window. A training step is bound by the host: one kernel and one sum forward, one kernel backward."""
@@ -197,12 +176,12 @@ class WeightedSum(torch.autograd.Function):
         border = metrics.WINDOW_SIZE - 1
         l1_scale = l1_weight / (height * width)
         ssim_scale = ssim_weight / ((height - border) * (width - 3 * border))
-        grid = (-(-width // COLUMNS), -(-height // ROWS), 1)
+        grid = -(-width // COLUMNS), -(-height // ROWS)
         wanted = ctx.needs_input_grad[0]
         slopes = prediction.new_empty(3 * height * width if wanted else 0)
         partials = prediction.new_empty(grid[0] * grid[1])
-        launch_forward(
-            grid, prediction, truth, slopes, partials, height, width, l1_scale, ssim_scale, constant,
+        forward_kernel[grid](
+            prediction, truth, slopes, partials, height, width, l1_scale, ssim_scale, constant,
             COLUMNS=COLUMNS, ROWS=ROWS, SLOPES=wanted, num_warps=WARPS,
         )  # fmt: skip
         ctx.save_for_backward(prediction, truth, slopes)
@@ -215,8 +194,8 @@ class WeightedSum(torch.autograd.Function):
         prediction, truth, slopes = ctx.saved_tensors
         height, width = prediction.shape[0], 3 * prediction.shape[1]
         d_prediction = torch.empty_like(prediction)
-        launch_backward(
-            ctx.grid, prediction, truth, slopes, d_loss, d_prediction, height, width, *ctx.scales,
+        backward_kernel[ctx.grid](
+            prediction, truth, slopes, d_loss, d_prediction, height, width, *ctx.scales,
             COLUMNS=COLUMNS, ROWS=ROWS, num_warps=WARPS,
         )  # fmt: skip
         return d_prediction, None, None, None, None

@@ -251,9 +251,7 @@ def composite(
         on CUDA also flatten_ids and isect_offsets, the lists of the splats that each tile draws.
     """
     colors, opacities = colors.to(projection.depths.dtype), opacities.to(projection.depths.dtype)
-    backend = _backend(colors.device, "compositing")
-    leave_out = not assume_finite and backend.leaves_out(projection, colors, opacities)
-    if not assume_finite and not leave_out:
+    if not assume_finite:
         # A row that is not finite would spread over every pixel that it covers, and on into all splats' gradients.
         drawable = torch.isfinite(colors.detach().sum(-1) + opacities.detach())
         colors, opacities = colors.where(drawable[:, None], 0.0), opacities.where(drawable, 0.0)
@@ -264,7 +262,8 @@ def composite(
         if backgrounds is not None:
             backgrounds = torch.cat([backgrounds, backgrounds.new_zeros(len(backgrounds), 1)], dim=-1)
 
-    render, alphas, lists = backend.composite(projection, colors, opacities, backgrounds, absgrad, leave_out)
+    backend = _backend(colors.device, "compositing")
+    render, alphas, lists = backend.composite(projection, colors, opacities, backgrounds, absgrad)
     if with_depth:
         render = torch.cat([render[..., :-1], render[..., -1:] / alphas.clamp(min=1e-10)], dim=-1)
     keys = "camera_ids", "gaussian_ids", "radii", "means2d", "depths", "conics", "width", "height", "n_cameras"

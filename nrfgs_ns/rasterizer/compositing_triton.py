@@ -31,7 +31,7 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nrfgs_ns.kernels.launch import Launcher
+from nrfgs_ns.kernels.tables import load_rows
 
 BLOCK = tl.constexpr(8)
 """Side of a tile in pixels."""
@@ -45,15 +45,6 @@ LN_2 = tl.constexpr(0.6931471805599453)
 MAX_ALPHA = tl.constexpr(0.999)
 MIN_ALPHA = tl.constexpr(1.0 / 255.0)
 MIN_TRANSMITTANCE = tl.constexpr(1e-4)
-
-
-@triton.jit
-def _rows(table, rows, valid, SIZE: tl.constexpr):
-    """Columns of some rows of a table [.., SIZE]."""
-    columns = ()
-    for i in tl.static_range(SIZE):
-        columns += (tl.load(table + rows * SIZE + i, mask=valid, other=0.0),)
-    return columns
 
 
 @triton.jit
@@ -92,13 +83,13 @@ def _batch(ids, at, end, column, means2d, conics, opacities, colors):
         place = at + tl.arange(0, LANES)[None, :] * EACH + k
         valid = place < end
         splat = tl.load(ids + place, mask=valid, other=0)
-        x, y = _rows(means2d, splat, valid, 2)
-        a, b, c = _rows(conics, splat, valid, 3)
+        x, y = load_rows(means2d, splat, valid, 2)
+        a, b, c = load_rows(conics, splat, valid, 3)
         a, b, c = a * (-0.5 * LOG2_E), b * -LOG2_E, c * (-0.5 * LOG2_E)
         dx = x - (column.to(tl.float32) + 0.5)
         opacity = tl.load(opacities + splat, mask=valid, other=0.0)
         peak = tl.where(opacity <= 0.0, -float("inf"), tl.log2(opacity))
-        splats += ((splat, dx, a * dx, b, c, y, peak, _rows(colors, splat, valid, 3)),)
+        splats += ((splat, dx, a * dx, b, c, y, peak, load_rows(colors, splat, valid, 3)),)
     return splats
 
 
@@ -179,7 +170,7 @@ def backward_kernel(
     left, worth = (), ()  # T and R of the block's rows, the next one's first
     for step in tl.static_range(BLOCK):
         pixel, inside = _pixels(top + step, column, width, height)
-        upstream, rgb = _rows(d_render, pixel, inside, 3), _rows(render, pixel, inside, 3)
+        upstream, rgb = load_rows(d_render, pixel, inside, 3), load_rows(render, pixel, inside, 3)
         value = tl.load(alphas + pixel, mask=inside, other=0.0) - 1.0
         value *= tl.load(d_alphas + pixel, mask=inside, other=0.0)
         for i in tl.static_range(3):
@@ -193,7 +184,7 @@ def backward_kernel(
             sums += ((none, none, none, none, none, none, none, none),)
         for row in range(BLOCK):
             pixel, inside = _pixels(top + row, column, width, height)
-            red, green, blue = _rows(d_render, pixel, inside, 3)
+            red, green, blue = load_rows(d_render, pixel, inside, 3)
             shown, drawn, weights, last, new_left = _blend(splats, top + row, left[0])
             gains, total = (), none
             for k in tl.static_range(EACH):
@@ -231,9 +222,6 @@ def backward_kernel(
                 _add(absgrad, splat, (abs_x * LN_2, abs_y * LN_2), 2)
 
 
-launch_forward, launch_backward = Launcher(forward_kernel), Launcher(backward_kernel)
-
-
 class CompositeSplats(torch.autograd.Function):
     """(means2d, conics, opacities, colors, background [1, 3]) -> (render [1, H, W, 3], alphas [1, H, W, 1]).
 
@@ -244,11 +232,11 @@ class CompositeSplats(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means2d, conics, opacities, colors, background, begins, ids, shape: tuple, absgrad: bool):
         width, height = ctx.shape = shape
-        ctx.absgrad, ctx.grid = absgrad, (begins.shape[2], begins.shape[1] - 1, 1)
+        ctx.absgrad, ctx.grid = absgrad, (begins.shape[2], begins.shape[1] - 1)
         render, alphas = means2d.new_empty(1, height, width, 3), means2d.new_empty(1, height, width, 1)
         tables = begins, ids, means2d, conics, opacities, colors
         results = render, alphas, ids.new_empty(ctx.grid[0] * ctx.grid[1])
-        launch_forward(ctx.grid, *tables, background, *results, *shape, num_warps=1)
+        forward_kernel[ctx.grid](*tables, background, *results, *shape, num_warps=1)
         ctx.save_for_backward(*tables, *results)
         return render, alphas
 
@@ -259,7 +247,7 @@ class CompositeSplats(torch.autograd.Function):
         gradients = [torch.zeros_like(table) for table in tables]
         absgrad = torch.zeros_like(tables[0]) if ctx.absgrad else alphas
         arguments = *saved, d_render.contiguous(), d_alphas.contiguous(), *gradients, absgrad, *ctx.shape
-        launch_backward(ctx.grid, *arguments, ABSGRAD=ctx.absgrad, num_warps=1)
+        backward_kernel[ctx.grid](*arguments, ABSGRAD=ctx.absgrad, num_warps=1)
         if ctx.absgrad:
             tables[0].absgrad = absgrad
         background = ((1.0 - alphas) * d_render).sum((1, 2)) if ctx.needs_input_grad[4] else None

@@ -14,8 +14,6 @@ compiled kernels raise.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from gsplat import fully_fused_projection, isect_offset_encode, isect_tiles, rasterize_to_pixels, spherical_harmonics
 from torch import Tensor
@@ -25,16 +23,11 @@ from nrfgs_ns.kernels.trial import tried_once
 
 from . import EPS2D, TILE_SIZE, Projection, ProjectionOptions
 
-if TYPE_CHECKING:  # imports Triton
-    from .tile_lists import Room
-
 HAS_BATCHES = gsplat_version() >= (1, 5)
 if (installed := ".".join(map(str, gsplat_version()))) not in GSPLAT:
     raise ImportError(f"gsplat {installed} is not known here; use {' or '.join(GSPLAT)}.")
 
-MOST_CHECKED = 8  # channels that the kernels of `tile_lists.py` check for finite numbers
 MOST_TILES = 2**16  # tiles with a 16-bit number, as `tile_lists.py` needs
-SMALL_TILE = 8  # pixels: side of the tiles of images with gradients, which go through the lists twice
 
 
 def load_kernels(device: torch.device) -> None:
@@ -119,35 +112,17 @@ def _visible_rows(geometry: tuple[Tensor, ...], cameras: tuple, options: Project
 
 
 def composite(
-    projection: Projection,
-    colors: Tensor,
-    opacities: Tensor,
-    backgrounds: Tensor | None,
-    absgrad: bool,
-    leave_out: bool,
+    projection: Projection, colors: Tensor, opacities: Tensor, backgrounds: Tensor | None, absgrad: bool
 ) -> tuple[Tensor, Tensor, dict]:
-    """Render [C, H, W, D] over backgrounds [C, D], alphas [C, H, W, 1], and gsplat's tile lists for `info`.
-
-    Args:
-        leave_out: do not draw rows that are not finite; only if `leaves_out` allows it.
-    """
-    side = TILE_SIZE
-    room = None
-    ours = False
-    if len(opacities) > 0 and _kernels_take(projection, opacities):
-        from .tile_lists import room_on
-
-        room = room_on(opacities.device)
-        if torch.is_grad_enabled():
-            ours = colors.shape[1] == 3 and _compositing_runs_on(colors.device)
-            side = SMALL_TILE if ours or _tiles(projection, SMALL_TILE) <= MOST_TILES else TILE_SIZE
+    """Render [C, H, W, D] over backgrounds [C, D], alphas [C, H, W, 1], and gsplat's tile lists for `info`."""
+    listed = _kernels_take(projection, opacities)
+    ours = listed and torch.is_grad_enabled() and colors.shape[1] == 3 and _compositing_runs_on(colors.device)
+    side = TILE_SIZE // 2 if ours else TILE_SIZE
     tables = projection.means2d, projection.conics, colors, opacities
     shape = projection.width, projection.height, side
-    while True:
-        lists = _lists(projection, opacities, side, room, colors if leave_out else None, ours)
-        render, alphas = (_our_image if ours else _gsplats_image)(tables, backgrounds, shape, lists, absgrad)
-        if room is None or room.was_enough():
-            return render, alphas, {"isect_offsets": lists[0], "flatten_ids": lists[1], "tile_size": side}
+    lists = _lists(projection, opacities, side, by_gsplat=not listed)
+    render, alphas = (_our_image if ours else _gsplats_image)(tables, backgrounds, shape, lists, absgrad)
+    return render, alphas, {"isect_offsets": lists[0], "flatten_ids": lists[1], "tile_size": side}
 
 
 def _gsplats_image(
@@ -174,21 +149,12 @@ def _our_image(
     return CompositeSplats.apply(means2d, conics, opacities, colors, background, *lists, shape[:2], absgrad)
 
 
-def leaves_out(projection: Projection, colors: Tensor, opacities: Tensor) -> bool:
-    """Whether `composite` can leave out rows that are not finite. Their gradients would not all be 0."""
-    return colors.shape[-1] <= MOST_CHECKED and not torch.is_grad_enabled() and _kernels_take(projection, opacities)
-
-
-def _lists(
-    projection: Projection, opacities: Tensor, side: int, room: Room | None, finite: Tensor | None, split: bool
-) -> tuple[Tensor, Tensor]:
-    """Offsets into a list of rows, and the list: the splats that each tile draws, as gsplat's kernels take them.
+def _lists(projection: Projection, opacities: Tensor, side: int, by_gsplat: bool) -> tuple[Tensor, Tensor]:
+    """Offsets into a list of rows, and the list: the splats that each tile draws, as the compositing kernels take them.
 
     Args:
-        side: of a tile, in pixels.
-        room: for the kernels of `tile_lists.py`; None: gsplat makes the lists.
-        finite: colours [M, D]; rows that are not finite, in these or otherwise, are left out.
-        split: for our compositing alone; see `tile_lists`.
+        side: of a tile, in pixels; for our compositing half of gsplat's.
+        by_gsplat: gsplat makes the lists, not the kernels of `tile_lists.py`.
     """
     tile_width, tile_height = -(-projection.width // side), -(-projection.height // side)
     bounds = projection.radii
@@ -196,12 +162,11 @@ def _lists(
         extents = projection.extents  # a square where another device has projected them
         bounds = projection.radii[:, None].expand(-1, 2) if extents is None else extents
     means2d, depths, conics = projection.means2d, projection.depths, projection.conics
-    if room is not None:
+    if not by_gsplat:
         from .tile_lists import tile_lists
 
         tables = (table.detach().contiguous() for table in (means2d, bounds, depths, conics, opacities))
-        colors = None if finite is None else finite.detach().contiguous()
-        return tile_lists(*tables, tile_width, tile_height, side, colors, room, split)
+        return tile_lists(*tables, tile_width, tile_height, split=side < TILE_SIZE)
     images = {"n_cameras": projection.n_cameras, "camera_ids": projection.camera_ids}
     if HAS_BATCHES:
         images = {"n_images": projection.n_cameras, "image_ids": projection.camera_ids}
@@ -212,43 +177,41 @@ def _lists(
 
 
 def _kernels_take(projection: Projection, opacities: Tensor) -> bool:
-    """Whether the kernels of `tile_lists.py` make the lists."""
+    """Whether the kernels of `tile_lists.py` make the lists, of at least one splat."""
+    tiles = -(-projection.width // TILE_SIZE) * (-(-projection.height // TILE_SIZE) + 1)  # with the row below the image
     return (
         projection.n_cameras == 1
-        and _tiles(projection, TILE_SIZE) <= MOST_TILES
+        and len(opacities) > 0
+        and tiles <= MOST_TILES
         and opacities.dtype == projection.means2d.dtype == torch.float32
         and _kernels_run_on(opacities.device)
     )
 
 
-def _tiles(projection: Projection, side: int) -> int:
-    """Tiles of an image and of the row below it."""
-    return -(-projection.width // side) * (-(-projection.height // side) + 1)
-
-
 @tried_once("The list of each tile's splats")
-def _kernels_run_on(device: torch.device) -> None:
+def _kernels_run_on(device: torch.device) -> bool:
     """Whether the kernels of `tile_lists.py` run on a device."""
-    for side in (SMALL_TILE, TILE_SIZE):
-        _lists_of_one(device, side)
+    _lists_of_one(device)
+    return True
 
 
 @tried_once("Compositing of training images, which needs Triton 3.4 or newer,")
-def _compositing_runs_on(device: torch.device) -> None:
+def _compositing_runs_on(device: torch.device) -> bool:
     """Whether the kernels of `compositing_triton.py`, and that which splits lists, run on a device."""
     from .compositing_triton import CompositeSplats
 
-    lists = _lists_of_one(device, SMALL_TILE, split=True)
+    lists = _lists_of_one(device, split=True)
     leaf = torch.ones(1, 3, device=device, requires_grad=True)
     for absgrad in (False, True):
         tables = leaf[:, :2].contiguous(), leaf * 1, leaf[:, 0].contiguous(), leaf * 1, torch.zeros_like(leaf)
         CompositeSplats.apply(*tables, *lists, (1, 1), absgrad)[0].sum().backward()
+    return True
 
 
-def _lists_of_one(device: torch.device, side: int, split: bool = False) -> tuple[Tensor, Tensor]:
+def _lists_of_one(device: torch.device, split: bool = False) -> tuple[Tensor, Tensor]:
     """The list of an image's only tile, of one splat."""
     from .tile_lists import tile_lists
 
     ones = torch.ones(1, 3, device=device)
     radii = torch.ones(1, 2, dtype=torch.int32, device=device) if HAS_BATCHES else ones[0, :1].int()
-    return tile_lists(ones[:, :2].contiguous(), radii, ones[0, :1], ones, ones[0, :1], 1, 1, side, split=split)
+    return tile_lists(ones[:, :2].contiguous(), radii, ones[0, :1], ones, ones[0, :1], 1, 1, split=split)

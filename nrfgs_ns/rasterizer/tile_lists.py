@@ -28,7 +28,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from nrfgs_ns.kernels.launch import Launcher
+from nrfgs_ns.kernels.tables import load_rows
 
 from . import TILE_SIZE
 
@@ -38,7 +38,7 @@ PAIRS = 256
 """Pairs of a splat and a tile that one program lists; a power of two."""
 BATCH = 256
 """Pairs that one program splits at a time; a power of two, at most 2^15."""
-GSPLATS = tl.constexpr(TILE_SIZE)
+TILE = tl.constexpr(TILE_SIZE)
 """Side of gsplat's tiles in pixels."""
 FIRST = tl.constexpr(-(2**15))
 """The first tile's number."""
@@ -52,11 +52,8 @@ MARGIN = tl.constexpr(1e-3)
 @triton.jit
 def _ellipse(means2d, conics, opacities, rows, valid):
     """Centre, conic, bound of 2 sigma and determinant of the splats in `rows`."""
-    x = tl.load(means2d + rows * 2, mask=valid, other=0.0)
-    y = tl.load(means2d + rows * 2 + 1, mask=valid, other=0.0)
-    a = tl.load(conics + rows * 3, mask=valid, other=1.0)
-    b = tl.load(conics + rows * 3 + 1, mask=valid, other=0.0)
-    c = tl.load(conics + rows * 3 + 2, mask=valid, other=1.0)
+    x, y = load_rows(means2d, rows, valid, 2)
+    a, b, c = load_rows(conics, rows, valid, 3)
     opacity = tl.load(opacities + rows, mask=valid, other=0.0)
     bound = 2.0 * (tl.log(255.0 * opacity) + SLACK)
     # The determinant of a long splat is a small difference of large products.
@@ -65,22 +62,21 @@ def _ellipse(means2d, conics, opacities, rows, valid):
 
 
 @triton.jit
-def _box(x, y, radii, rows, valid, width, height, SIDE: tl.constexpr, RADII: tl.constexpr):
-    """The tiles inside gsplat's tiles of a splat: first and end of columns and rows."""
-    SHARE: tl.constexpr = GSPLATS // SIDE
-    center_x, center_y = x / GSPLATS, y / GSPLATS
-    reach_x = tl.load(radii + rows * RADII, mask=valid, other=0).to(tl.float32) / GSPLATS
-    reach_y = tl.load(radii + rows * RADII + (RADII - 1), mask=valid, other=0).to(tl.float32) / GSPLATS
-    left = tl.minimum(tl.maximum(tl.floor(center_x - reach_x) * SHARE, 0.0), width).to(tl.int32)
-    top = tl.minimum(tl.maximum(tl.floor(center_y - reach_y) * SHARE, 0.0), height).to(tl.int32)
-    right = tl.minimum(tl.maximum(tl.ceil(center_x + reach_x) * SHARE, 0.0), width).to(tl.int32)
-    bottom = tl.minimum(tl.maximum(tl.ceil(center_y + reach_y) * SHARE, 0.0), height).to(tl.int32)
+def _box(x, y, radii, rows, valid, width, height, RADII: tl.constexpr):
+    """First and end of the columns and rows of gsplat's tiles around a splat."""
+    center_x, center_y = x / TILE, y / TILE
+    reach_x = tl.load(radii + rows * RADII, mask=valid, other=0).to(tl.float32) / TILE
+    reach_y = tl.load(radii + rows * RADII + (RADII - 1), mask=valid, other=0).to(tl.float32) / TILE
+    left = tl.minimum(tl.maximum(tl.floor(center_x - reach_x), 0.0), width).to(tl.int32)
+    top = tl.minimum(tl.maximum(tl.floor(center_y - reach_y), 0.0), height).to(tl.int32)
+    right = tl.minimum(tl.maximum(tl.ceil(center_x + reach_x), 0.0), width).to(tl.int32)
+    bottom = tl.minimum(tl.maximum(tl.ceil(center_y + reach_y), 0.0), height).to(tl.int32)
     return left, top, right, tl.where(reach_x > 0.0, bottom, top)
 
 
 @triton.jit
 def _columns(row, x, y, a, b, c, bound, det, left, right, SIDE: tl.constexpr):
-    """First and end of the columns of tiles in which a splat meets a row of tiles."""
+    """First and end of the columns of tiles of a side in which a splat meets a row of tiles."""
     # Centres of the row's pixels, from the splat's.
     above = row.to(tl.float32) * SIDE + 0.5 - y
     below = above + (SIDE - 1.0)
@@ -110,27 +106,20 @@ def _columns(row, x, y, a, b, c, bound, det, left, right, SIDE: tl.constexpr):
 
 @triton.jit(do_not_specialize=["count", "width", "height"])
 def count_kernel(
-    means2d, conics, opacities, radii, order, counts, colors, count, width, height,
-    SPLATS: tl.constexpr, SIDE: tl.constexpr, RADII: tl.constexpr, CHANNELS: tl.constexpr,
+    means2d, conics, opacities, radii, order, counts, count, width, height,
+    SPLATS: tl.constexpr, RADII: tl.constexpr,
 ):  # fmt: skip
-    """Number of tiles that each splat is listed in, by its place in `order`; with CHANNELS, 0 where a number is not
-    finite."""
+    """Number of tiles that each splat is listed in, by its place in `order`."""
     at = tl.program_id(0) * SPLATS + tl.arange(0, SPLATS)
     valid = at < count
     rows = tl.load(order + at, mask=valid, other=0)
     x, y, a, b, c, bound, det = _ellipse(means2d, conics, opacities, rows, valid)
-    left, top, right, bottom = _box(x, y, radii, rows, valid, width, height, SIDE, RADII)
-    drawn = valid & ~(bound <= 0.0)
-    if CHANNELS > 0:
-        total = x + y + a + b + c + bound
-        for channel in tl.static_range(CHANNELS):
-            total += tl.load(colors + rows * CHANNELS + channel, mask=valid, other=0.0)
-        drawn = drawn & (tl.abs(total) < float("inf"))
-    bottom = tl.where(drawn, bottom, top)
+    left, top, right, bottom = _box(x, y, radii, rows, valid, width, height, RADII)
+    bottom = tl.where(valid & ~(bound <= 0.0), bottom, top)
     tiles = tl.zeros((SPLATS,), tl.int32)
     for step in range(tl.max(bottom - top, axis=0)):
         row = top + step
-        first, end = _columns(row, x, y, a, b, c, bound, det, left, right, SIDE)
+        first, end = _columns(row, x, y, a, b, c, bound, det, left, right, TILE)
         tiles += tl.where(row < bottom, end - first, 0)
     tl.store(counts + at, tiles, mask=valid)
 
@@ -138,7 +127,7 @@ def count_kernel(
 @triton.jit(do_not_specialize=["count", "pairs", "width", "height"])
 def list_kernel(
     means2d, conics, opacities, radii, order, ends, tiles, splats, count, pairs, width, height,
-    PAIRS: tl.constexpr, SIDE: tl.constexpr, RADII: tl.constexpr, SPLIT: tl.constexpr,
+    PAIRS: tl.constexpr, RADII: tl.constexpr, SPLIT: tl.constexpr,
 ):  # fmt: skip
     """The tile and the splat of each pair, splats in `order`; with SPLIT, the upper four of the splat's 32 bits are for
     the tile's quarters, row by row. Pairs beyond the last, and those that rounding has left without a tile, get a tile
@@ -157,13 +146,13 @@ def list_kernel(
     begin = tl.load(ends + low - 1, mask=low > 0, other=0)
     rows = tl.load(order + low)
     x, y, a, b, c, bound, det = _ellipse(means2d, conics, opacities, rows, valid)
-    left, top, right, bottom = _box(x, y, radii, rows, valid, width, height, SIDE, RADII)
+    left, top, right, bottom = _box(x, y, radii, rows, valid, width, height, RADII)
     left_over = tl.where(real, at - begin, -1).to(tl.int32)  # tiles of the splat before the pair's, in rows to come
     # Spread over a row: in a single tile, spare pairs would keep its threads busy for longer than the image takes.
     tile = width * height + at % width
     row = top
     while tl.max(tl.where(row < bottom, left_over, -1), axis=0) >= 0:
-        first, end = _columns(row, x, y, a, b, c, bound, det, left, right, SIDE)
+        first, end = _columns(row, x, y, a, b, c, bound, det, left, right, TILE)
         here = (left_over >= 0) & (left_over < end - first)
         tile = tl.where(here, row * width + first + left_over, tile)
         left_over = tl.where(here, -1, left_over - tl.where(left_over >= 0, end - first, 0))
@@ -172,7 +161,7 @@ def list_kernel(
     if SPLIT:
         for quarter in tl.static_range(4):
             row, column = tile // width * 2 + quarter // 2, tile % width * 2 + quarter % 2
-            first, end = _columns(row, x, y, a, b, c, bound, det, left * 2, right * 2, SIDE // 2)
+            first, end = _columns(row, x, y, a, b, c, bound, det, left * 2, right * 2, TILE // 2)
             rows |= ((first <= column) & (column < end)).to(tl.int32) << (quarter + 28)
     tl.store(tiles + at, (tile + FIRST).to(tl.int16), mask=valid)
     tl.store(splats + at, rows, mask=valid)
@@ -202,78 +191,35 @@ def split_kernel(begins, splats, places, lists, width, height, BATCH: tl.constex
         tl.store(places + 1, place, mask=inside)
 
 
-launch_count, launch_list, launch_split = Launcher(count_kernel), Launcher(list_kernel), Launcher(split_kernel)
-
-
-MORE = 1.25
-"""Room for each recent pair."""
-KEPT = 0.99
-"""Share of the room that remains for the next image, if it needs less."""
-_ROOMS = threading.local()  # by device; a viewer's thread draws other images than a training's
+_THREAD = threading.local()
+"""`room`, where one is in use: a viewer's thread draws other images than a training's."""
 
 
 class Room:
-    """Room on a GPU for the pairs of splats and tiles of an image.
+    """Constant room for `pairs` of splats and tiles on a device, for a CUDA graph.
 
-    Only the GPU knows how many pairs an image has, and asking it first would leave it idle. So the host makes room for
-    a little more than in recent images, goes on, and checks whether that was enough once the image is on its way.
+    Only the GPU knows how many pairs an image has, and a graph cannot wait for the number: its owner checks it after
+    the graph has run.
     """
-
-    def __init__(self):
-        self.pairs = 0
-        with torch.inference_mode(False):  # it outlives a rendering that records nothing
-            self._counted = torch.empty(1, dtype=torch.int64, pin_memory=True)
-        self._arrived = torch.cuda.Event()
-
-    def send(self, total: Tensor) -> None:
-        """Send the number of pairs [1] to the host."""
-        self._counted.copy_(total, non_blocking=True)
-        self._arrived.record()
-
-    def was_enough(self) -> bool:
-        """Whether there was room for all pairs; makes room for them and for the next image. Waits for the number."""
-        self._arrived.synchronize()
-        room = self.pairs
-        pairs = int(self._counted[0])
-        self.pairs = max(int(MORE * pairs), int(KEPT * room))
-        return pairs <= room
-
-
-class FixedRoom:
-    """Constant room for `pairs` on a device, for a CUDA graph; its owner checks it after the graph has run."""
 
     def __init__(self, pairs: int, device: torch.device):
         self.pairs = pairs
         self.counted = torch.full((2,), -1, dtype=torch.int64, device=device)
         """pairs of the last image, and the most of any; -1 before the first"""
 
-    def send(self, total: Tensor) -> None:
-        """Keep the number of pairs [1], on the GPU."""
+    def keep(self, total: Tensor) -> None:
+        """Keep an image's number of pairs [1], on the GPU."""
         self.counted[:1].copy_(total)
         torch.maximum(self.counted[1:], total, out=self.counted[1:])
-
-    def was_enough(self) -> bool:
-        return True
 
     @contextmanager
     def in_use(self) -> Iterator[None]:
         """Use this room for the images of this thread."""
-        rooms = _ROOMS.__dict__
-        device = self.counted.device
-        usual = rooms.get(device)
-        rooms[device] = self
+        _THREAD.room = self
         try:
             yield
         finally:
-            rooms[device] = usual
-
-
-def room_on(device: torch.device) -> Room | FixedRoom:
-    """The room on a GPU for the images of this thread."""
-    rooms = _ROOMS.__dict__
-    if rooms.get(device) is None:
-        rooms[device] = Room()
-    return rooms[device]
+            del _THREAD.room
 
 
 def tile_lists(
@@ -284,22 +230,16 @@ def tile_lists(
     opacities: Tensor,
     width: int,
     height: int,
-    side: int,
-    colors: Tensor | None = None,
-    room: Room | FixedRoom | None = None,
     split: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """Lists of one camera's tiles. All tensors are contiguous.
+    """Lists of one camera's tiles, in the thread's `Room` if one is in use. All tensors are contiguous.
 
     Args:
         means2d, depths, conics: a `Projection`'s, M >= 1 rows; if split, fewer than 2^28.
         radii: half the sides, in pixels, of the boxes that bound the splats: of squares [M] or of rectangles [M, 2].
         opacities: as composited, compensation included, [M].
         width, height: image size in tiles; with the row below, at most 2^16 that are not split.
-        side: side of a tile in pixels, `TILE_SIZE` or a part of it.
-        colors: [M, D]; splats that are not finite, in these or otherwise, are left out. None: no check.
-        room: makes room for its number of pairs and is sent the actual one; None: wait for the number.
-        split: list in tiles of twice the side, for which there is room, and split these lists.
+        split: tiles have half of gsplat's side: the lists of gsplat's tiles, for which there is room, are split.
 
     Returns:
         Where each tile's splats begin, int32 [1, height + 1, width], the last row for tiles below the image; rows of
@@ -307,26 +247,25 @@ def tile_lists(
         is not set, and not for gsplat's kernels, which would read it.
     """
     if split:
-        size, side, width, height = (width, height), 2 * side, -(-width // 2), -(-height // 2)
+        size, width, height = (width, height), -(-width // 2), -(-height // 2)
     count, device, axes = len(depths), depths.device, 1 if radii.dim() == 1 else 2
     order = torch.sort(depths, stable=True).indices
     counts = torch.empty(count, dtype=torch.int32, device=device)
     splats = means2d, conics, opacities, radii, order
-    launch_count(
-        (-(-count // SPLATS), 1, 1), *splats, counts, conics if colors is None else colors, count, width, height,
-        SPLATS=SPLATS, SIDE=side, RADII=axes, CHANNELS=0 if colors is None else colors.shape[1], num_warps=2,
-    )  # fmt: skip
+    grid = (-(-count // SPLATS),)
+    count_kernel[grid](*splats, counts, count, width, height, SPLATS=SPLATS, RADII=axes, num_warps=2)
     ends = counts.cumsum(0)
+    room = getattr(_THREAD, "room", None)
     if room is None:
         pairs = int(ends[-1])
     else:
-        room.send(ends[-1:])
+        room.keep(ends[-1:])
         pairs = room.pairs
     tiles, rows = (torch.empty(pairs, dtype=dtype, device=device) for dtype in (torch.int16, torch.int32))
     if pairs > 0:
-        launch_list(
-            (-(-pairs // PAIRS), 1, 1), *splats, ends, tiles, rows, count, pairs, width, height,
-            PAIRS=PAIRS, SIDE=side, RADII=axes, SPLIT=split, num_warps=4,
+        list_kernel[(-(-pairs // PAIRS),)](
+            *splats, ends, tiles, rows, count, pairs, width, height,
+            PAIRS=PAIRS, RADII=axes, SPLIT=split, num_warps=4,
         )  # fmt: skip
     tiles, by_tile = torch.sort(tiles, stable=True)
     numbers = torch.arange(FIRST.value, FIRST.value + width * (height + 1), dtype=torch.int16, device=device)
@@ -336,7 +275,7 @@ def tile_lists(
         return begins.view(1, height + 1, width), rows
     places = rows.new_zeros(size[1] + 1, size[0])
     lists = rows.new_empty(4 * pairs)
-    launch_split((width, height, 1), begins, rows, places, lists, *size, BATCH=BATCH, COUNT=True, num_warps=2)
+    split_kernel[(width, height)](begins, rows, places, lists, *size, BATCH=BATCH, COUNT=True, num_warps=2)
     places = places.flatten().cumsum(0, dtype=torch.int32).view(1, *places.shape)
-    launch_split((width, height, 1), begins, rows, places, lists, *size, BATCH=BATCH, COUNT=False, num_warps=2)
+    split_kernel[(width, height)](begins, rows, places, lists, *size, BATCH=BATCH, COUNT=False, num_warps=2)
     return places, lists

@@ -16,8 +16,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from nrfgs_ns.kernels.launch import ALIGNMENT, Launcher
-
+ALIGNMENT = 16
+"""Bytes of four numbers; parts of PyTorch's allocations may be unaligned."""
 BLOCK = 512
 """Numbers per program; a power of two."""
 WARPS = 4
@@ -97,9 +97,6 @@ def adam_kernel(base, table, skip, BLOCK: tl.constexpr, COLUMNS: tl.constexpr):
         tl.store(squares, square, mask=inside)
 
 
-launch = Launcher(adam_kernel)
-
-
 class AdamTable:
     """The table on one device, and its copy in host memory, where addresses and sizes are written if they change."""
 
@@ -147,7 +144,7 @@ class AdamTable:
         if self.copied is not None:
             self.copied.record()
         skip = self.never if skip is None else skip
-        launch((self.programs, 1, 1), base, self.device, skip, BLOCK=BLOCK, COLUMNS=COLUMNS, num_warps=WARPS)
+        adam_kernel[(self.programs,)](base, self.device, skip, BLOCK=BLOCK, COLUMNS=COLUMNS, num_warps=WARPS)
         for _, parameter, _ in work:  # PyTorch cannot know that they have been written to
             torch.autograd.graph.increment_version(parameter)
         return True

@@ -121,7 +121,7 @@ class LeanOptimizers(Optimizers):
 
 
 @tried_once("Adam")
-def try_kernel(device: torch.device) -> None:
+def try_kernel(device: torch.device) -> bool:
     """Whether Adam's kernel runs on a CUDA device; compiles it before the first step."""
     from nrfgs_ns.training.adam_triton import AdamTable
 
@@ -131,6 +131,7 @@ def try_kernel(device: torch.device) -> None:
     group = {"lr": 0.1, "betas": (0.9, 0.999), "eps": 1e-15, "weight_decay": 0.0}
     with torch.no_grad():
         AdamTable(device).step([(group, number, state)], None)
+    return True
 
 
 def is_fused(optimizer: Optimizer) -> bool:

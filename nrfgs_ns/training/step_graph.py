@@ -183,11 +183,11 @@ class StepGraphs:
     def _most_pairs(self) -> int:
         """The most pairs of any of about `VIEWS_COUNTED` views; RuntimeError where gsplat makes the tiles' lists, not
         `tile_lists.py`."""
-        from nrfgs_ns.rasterizer.tile_lists import FixedRoom
+        from nrfgs_ns.rasterizer.tile_lists import Room
 
         model = self.model
         field = model.field
-        room = FixedRoom(1, model.device)
+        room = Room(1, model.device)
         count = len(self.datamanager.train_dataset)
         for index in range(0, count, max(count // VIEWS_COUNTED, 1)):
             camera, _ = self.datamanager.train_view(index)
@@ -227,7 +227,7 @@ class _StepGraph:
     """
 
     def __init__(self, model, pinhole: Pinhole, batch: Mapping[str, Any], pairs: int, pool: Any, stream: Any):
-        from nrfgs_ns.rasterizer.tile_lists import FixedRoom
+        from nrfgs_ns.rasterizer.tile_lists import Room
 
         self.model, self.count = model, model.num_points
         self.parameters = {f"splats.{name}": value for name, value in model.gauss_params.items()}
@@ -237,7 +237,7 @@ class _StepGraph:
         self.pinhole = pinhole._replace(**matrices)
         self.batch = {name: batch[name].to(device, copy=True) for name in ("image", "mask") if name in batch}
         self.is_between = "between" in batch
-        self.room = FixedRoom(pairs, device)
+        self.room = Room(pairs, device)
         self._counted = torch.ones(2, dtype=torch.int64, pin_memory=True)
         self._arrived = torch.cuda.Event()
         self._arrived.record()

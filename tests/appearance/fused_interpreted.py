@@ -122,7 +122,7 @@ def test_extremes(extreme, opacity_bound, scale):
     # Large numbers before tanh leave float32 with few digits of what tanh still sees. PyTorch in float32 loses them as
     # well: the kernels, which only round in another order, may not lose ten times as much.
     plain, _ = heads()
-    plain.config, plain.fused.config = twin.config, twin.config
+    plain.config, plain.fused = twin.config, twin.fused
     plain.load_state_dict(twin.state_dict())
     errors = relative_errors(evaluate(plain.float(), *case), exact)
     assert_near(evaluate(head, *case), exact, {n: float32_tolerance() + 10 * error for n, error in errors.items()})

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import math
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -11,7 +12,6 @@ from torch.testing import assert_close
 from nrfgs_ns.appearance.head import SH_C0
 from nrfgs_ns.appearance.nrf import NrfConfig, bounded_opacity
 from nrfgs_ns.appearance.sh import ShConfig
-from nrfgs_ns.errors import InputError
 
 
 def by_hand(head, splats, visible, centers):
@@ -92,17 +92,20 @@ def test_impossible_settings_are_named(field, value):
 
 
 # When the fused kernels are chosen; fused_interpreted.py tests them.
-@pytest.mark.parametrize("interpreted, dtype, sizes, reason", [
-    ("0", torch.float32, {}, "the splats are on cpu"),
-    ("1", torch.float64, {}, "the splats are not float32"),
-    *(
-        ("1", torch.float32, sizes, "its sizes are beyond the kernels'")
-        for sizes in ({"latent_dim": 65}, {"hidden_width": 129}, {"hidden_width": 65, "num_bands": 5})
-    ),
-])  # fmt: skip
-def test_demanding_the_impossible_names_the_reason(interpreted, dtype, sizes, reason, monkeypatch):
-    monkeypatch.setenv("TRITON_INTERPRET", interpreted)
+@pytest.mark.parametrize("sizes", [{"latent_dim": 65}, {"hidden_width": 129}, {"hidden_width": 65, "num_bands": 5}])
+def test_sizes_beyond_the_kernels_are_named(sizes, caplog):
     head, _ = heads(**sizes)
-    splats, visible, centers = fused_scene(head, 20, 15)
-    with pytest.raises(InputError, match=f"implementation is 'fused', but {reason}.*auto or torch"):
-        head({**splats, "latents": splats["latents"].to(dtype)}, visible, centers)
+    assert head.fused.prepared_on(torch.device("cpu")) is None
+    assert "The field is slower on cpu" in caplog.text and "its sizes are beyond the kernels'" in caplog.text
+
+
+def test_pytorch_computes_on_a_cpu_and_what_is_not_float32():
+    splats, _, _ = fused_scene(heads()[0], 20, 15)
+    head = NrfConfig(implementation="fused").setup()  # in a configuration that 0.2.0 has saved
+    assert not head.fused.takes(splats)
+    on_gpu = {name: Mock(device=torch.device("cuda"), dtype=torch.float32) for name in splats}
+    head.fused.prepared_on = lambda device: "prepared"
+    assert head.fused.takes(on_gpu)
+    assert not head.fused.takes({**on_gpu, "latents": Mock(dtype=torch.float64)})
+    head.config.implementation = "torch"
+    assert not head.fused.takes(on_gpu)

@@ -5,10 +5,11 @@ import math
 
 import pytest
 import torch
+from exposures import exposed
 
 from nrfgs_ns.image import overlap
 from nrfgs_ns.image.overlap import ENOUGH_KNOWN_STOPS, ENOUGH_STOPS, Pairs, compare, estimate, sight, slope, spread
-from nrfgs_ns.image.photograph import BASIS, exposed
+from nrfgs_ns.image.photograph import BASIS
 
 WIDTH, HEIGHT, FOCAL = 120, 90, 110.0
 K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])

@@ -3,8 +3,9 @@
 
 import pytest
 import torch
+from exposures import exposed
 
-from nrfgs_ns.image.photograph import BASIS, PhotographModel, exposed
+from nrfgs_ns.image.photograph import BASIS, PhotographModel
 
 
 def model_of(seed: int | None = None) -> PhotographModel:

@@ -228,11 +228,10 @@ class TestOnCuda:
         from nrfgs_ns.rasterizer.tile_lists import tile_lists
 
         of = splats(3000, 300, 200)
-        lists = tile_lists(*(table.cuda() for table in of), *shape)
-        assert_lists(*(part.cpu() for part in lists), of, *shape, TILE_SIZE)
-        if shape[2] < TILE_SIZE:
-            begins, rows = tile_lists(*(table.cuda() for table in of), *shape, split=True)
-            assert torch.equal(begins, lists[0]) and torch.equal(rows[: len(lists[1])], lists[1])
+        width, height, side = shape
+        lists = tile_lists(*(table.cuda() for table in of), width, height, split=side < TILE_SIZE)
+        begins, rows = (part.cpu() for part in lists)
+        assert_lists(begins, rows[: begins[0, -1, 0]], of, *shape)
 
     def test_more_small_tiles_than_numbers(self):
         """A splat in the last of 400 rows of 512 tiles."""
@@ -240,7 +239,7 @@ class TestOnCuda:
 
         one = torch.ones(1).cuda()
         last = torch.tensor([[4092.0, 3196.0]]).cuda(), one.int(), one, torch.tensor([[1.0, 0.0, 1.0]]).cuda(), one
-        begins, rows = tile_lists(*last, 512, 400, 8, split=True)
+        begins, rows = tile_lists(*last, 512, 400, split=True)
         assert begins.flatten().tolist() == [0] * 512 * 400 + [1] * 512 and rows[0] == 0
 
     @pytest.mark.parametrize("mode", ["RGB", "RGB+ED"])
@@ -277,13 +276,10 @@ class TestOnCuda:
             return [image.detach(), *(leaf.grad for leaf in leaves)], pairs
 
         assert gsplat_cuda._kernels_run_on(torch.device("cuda", 0))
-        small = render()
-        monkeypatch.setattr(gsplat_cuda, "SMALL_TILE", TILE_SIZE)
-        large = render()
+        mine, pairs = render()
         monkeypatch.setattr(gsplat_cuda, "MOST_TILES", 0)
         theirs, all_pairs = render()
-        assert large[1] <= all_pairs and large[1] <= small[1] <= 4 * large[1]
-        for mine, _ in (small, large):
-            torch.testing.assert_close(mine[0], theirs[0], rtol=0, atol=2e-6)
-            for got, expected in zip(mine[1:], theirs[1:], strict=True):
-                assert (got - expected).norm() <= 1e-5 * expected.norm()  # atomics add in any order
+        assert pairs <= all_pairs
+        torch.testing.assert_close(mine[0], theirs[0], rtol=0, atol=2e-6)
+        for got, expected in zip(mine[1:], theirs[1:], strict=True):
+            assert (got - expected).norm() <= 1e-5 * expected.norm()  # atomics add in any order

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from nrfgs_ns.rasterizer import TILE_SIZE
+
 
 class Splats(NamedTuple):
     """What `tile_lists` takes first."""
@@ -44,9 +46,9 @@ def splats(count: int, width: int, height: int, seed: int = 0) -> Splats:
     return Splats(*(table[seen] for table in (means2d, radii.int(), depths, conics, opacities)))
 
 
-def drawn_in(of: Splats, column: int, row: int, side: int, box: int) -> tuple[Tensor, Tensor]:
-    """Whether each splat reaches 1/255 at a pixel of a tile, in float64; and whether its square meets the tile of `box`
-    pixels that the tile lies in."""
+def drawn_in(of: Splats, column: int, row: int, side: int) -> tuple[Tensor, Tensor]:
+    """Whether each splat reaches 1/255 at a pixel of a tile, in float64; and whether its square meets gsplat's tile
+    that the tile lies in."""
     pixels = torch.arange(side, dtype=torch.float64) + 0.5
     dx = of.means2d[:, 0, None, None] - (column * side + pixels)[None, None, :]
     dy = of.means2d[:, 1, None, None] - (row * side + pixels)[None, :, None]
@@ -54,20 +56,18 @@ def drawn_in(of: Splats, column: int, row: int, side: int, box: int) -> tuple[Te
     sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
     reaches = (of.opacities.double()[:, None, None] * torch.exp(-sigma)).amax(dim=(1, 2)) >= 1.0 / 255.0
     radii = of.radii if of.radii.dim() == 2 else of.radii[:, None].expand(-1, 2)
-    first, end = (of.means2d - radii) / box, (of.means2d + radii) / box
-    tile = torch.tensor([column, row]) * side // box
+    first, end = (of.means2d - radii) / TILE_SIZE, (of.means2d + radii) / TILE_SIZE
+    tile = torch.tensor([column, row]) * side // TILE_SIZE
     return reaches, ((first.floor() <= tile) & (tile < end.ceil())).all(dim=1)
 
 
-def assert_lists(
-    begins: Tensor, rows: Tensor, of: Splats, width: int, height: int, side: int, box: int | None = None
-) -> int:
+def assert_lists(begins: Tensor, rows: Tensor, of: Splats, width: int, height: int, side: int) -> int:
     """Each tile lists what draws in it, nothing outside of the boxes, near before far, ties in the table's order.
     Returns how many splats are listed in tiles in which no pixel of theirs reaches 1/255."""
     assert begins.shape == (1, height + 1, width) and begins.dtype == rows.dtype == torch.int32
     starts, listed, spare = [*begins.flatten().tolist(), len(rows)], rows.tolist(), 0
     for tile in range(width * height):
-        reaches, boxed = drawn_in(of, tile % width, tile // width, side, box or side)
+        reaches, boxed = drawn_in(of, tile % width, tile // width, side)
         mine = listed[starts[tile] : starts[tile + 1]]
         assert mine == sorted(mine, key=lambda row: (of.depths[row].item(), row))
         assert len(set(mine)) == len(mine)

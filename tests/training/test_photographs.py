@@ -8,12 +8,13 @@ import shutil
 import numpy as np
 import pytest
 import torch
+from exposures import exposed
 from PIL import ExifTags, Image
 from short_trainings import assert_same_training, checkpoint_of, command_line, models_of, trained, untrained
 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.overlap import Pairs, estimate
-from nrfgs_ns.image.photograph import BASIS, exposed
+from nrfgs_ns.image.photograph import BASIS
 from nrfgs_ns.trained.loading import load_model
 from nrfgs_ns.training.photographs import exif_of, exposure, exposures, they_differ
 

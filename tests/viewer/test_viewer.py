@@ -10,6 +10,7 @@ import imageio.v3
 import numpy as np
 import pytest
 import torch
+from exposures import exposed
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.utils import colormaps
@@ -26,7 +27,7 @@ from nrfgs_ns.appearance.head import Field, SplatAppearance
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.appearance.sh import ShConfig
 from nrfgs_ns.data.datamanager import NrfgsInputDataset
-from nrfgs_ns.image.photograph import BASIS, exposed
+from nrfgs_ns.image.photograph import BASIS
 from nrfgs_ns.rasterizer import View
 from nrfgs_ns.viewer import pictures as drawn
 from nrfgs_ns.viewer import start

@@ -116,11 +116,9 @@ def _features_backward(d_F, waves, lanes, B: tl.constexpr, R: tl.constexpr, BAND
 
 @triton.jit
 def _bounded_opacity(logit, alpha, t, scale, BOUND: tl.constexpr):
-    """Opacity, and its derivatives by the logit and by t = tanh(d_alpha). See nrf.py."""
+    """Opacity, and its derivatives by the logit and by t = tanh(d_alpha), which is 0 without a residual. See nrf.py."""
     alpha_slope = alpha * (1.0 - alpha)
-    if BOUND == "none":  # no residual: nothing to bound
-        return alpha, alpha_slope, 0.0 * t
-    elif BOUND == "logit":
+    if BOUND == "logit":
         opacity = sigmoid(logit + t * scale * LOGIT_SLOPE)
         slope = opacity * (1.0 - opacity)
         return opacity, slope, slope * scale * LOGIT_SLOPE

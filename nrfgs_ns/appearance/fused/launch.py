@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Both kernels as one differentiable function of tables, camera centres and shared weights.
 
-A training step of a small scene is bound by the host, so launches are few: two to pack the weights, one forward, one to
-zero the tables' gradients unless every splat is visible, one backward, two to sum and unpack the weights' gradients.
+A training step of a small scene is bound by the host, so launches are few: two to pack the weights, one forward, four
+to zero the tables' gradients unless every splat is visible, one backward, two to sum and unpack the weights' gradients.
 """
 
 import functools
-import itertools
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -19,9 +18,6 @@ from nrfgs_ns.appearance.fused.kernels import backward_kernel, forward_kernel
 from nrfgs_ns.appearance.fused.packing import CENTER_SLOTS, Packing
 from nrfgs_ns.appearance.fused.tiles import INTERPRETED
 from nrfgs_ns.appearance.head import SH_C0
-from nrfgs_ns.kernels.launch import Launcher
-
-launch_forward, launch_backward = Launcher(forward_kernel), Launcher(backward_kernel)
 
 
 class Launch(NamedTuple):
@@ -96,31 +92,14 @@ INTERPRETER_PROGRAMS = 2
 """Programs in Triton's interpreter: as few as show that programs share the work."""
 
 
-class FieldOptions(NamedTuple):
-    """The part of the field's configuration that the kernels need."""
-
-    scalars: tuple[float, ...]
-    """squared smallest distance in world units, log of the world units in a scene unit, s_c, s_alpha, SH_C0"""
-    bound: str
-    """an OpacityBound, or "none" for a field without opacity residual"""
-    precision: str
-
-    @staticmethod
-    def of(config, scene_unit: float = 1.0) -> "FieldOptions":
-        """Options of an NrfConfig."""
-        eps_squared = (config.distance_eps * scene_unit) ** 2
-        scalars = eps_squared, math.log(scene_unit), config.color_scale, config.opacity_scale, SH_C0
-        return FieldOptions(scalars, config.bound if config.opacity_residual else "none", config.precision)
-
-
 class FusedFunction(torch.autograd.Function):
-    """(tables, visible rows, camera centres, shared weights) -> colours [M, 3], opacities [M].
+    """(NrfConfig, tables, visible rows, camera centres, shared weights) -> colours [M, 3], opacities [M].
 
     Camera centres [3] promise that no row of `visible` repeats. All tensors are float32 on one device, `visible` int64.
     """
 
     @staticmethod
-    def forward(ctx, packing: Packing, launches: Launches, options: FieldOptions, means, latents, features_dc,
+    def forward(ctx, packing: Packing, launches: Launches, config, scene_unit: float, means, latents, features_dc,
                 opacities, visible, centers, *weights):  # fmt: skip
         tables = [_contiguous(table) for table in (means, latents, features_dc, opacities)]
         visible, centers = _contiguous(visible), _contiguous(centers)
@@ -128,33 +107,36 @@ class FusedFunction(torch.autograd.Function):
         launch = launches.forward
         count = len(visible)
         outputs = packed.new_empty(count, 3), packed.new_empty(count)
+        eps_squared = (config.distance_eps * scene_unit) ** 2
+        scalars = eps_squared, math.log(scene_unit), config.color_scale, config.opacity_scale, SH_C0
         if count > 0:
-            launch_forward(
-                (_programs(launch, count, visible.device), 1, 1), *tables, visible, centers, packed, *outputs,
-                count, *options.scalars, **_constants(packing, launch, options, centers.dim() == 1),
+            forward_kernel[(_programs(launch, count, visible.device),)](
+                *tables, visible, centers, packed, *outputs,
+                count, *scalars, **_constants(packing, launch, config, centers.dim() == 1),
             )  # fmt: skip
         ctx.save_for_backward(*tables, visible, centers, packed)
-        ctx.packing, ctx.launch, ctx.options = packing, launches.backward, options
+        ctx.packing, ctx.launch, ctx.config, ctx.scalars = packing, launches.backward, config, scalars
         return outputs
 
     @staticmethod
     @once_differentiable
     def backward(ctx, d_colors, d_opacities):
-        packing, launch, options = ctx.packing, ctx.launch, ctx.options
+        packing, launch, config = ctx.packing, ctx.launch, ctx.config
         *tables, visible, centers, packed = ctx.saved_tensors
-        count, rows, device = len(visible), len(tables[0]), visible.device
-        one_center, wants_center = centers.dim() == 1, ctx.needs_input_grad[8]  # of forward's `centers`
+        count = len(visible)
+        one_center, wants_center = centers.dim() == 1, ctx.needs_input_grad[9]  # of forward's `centers`
         # Without zeros only where the kernel writes each row, once.
-        d_tables = _tables(rows, packing.latent_dim, device, zero=not one_center or count < rows)
+        each_row_once = one_center and count == len(tables[0])
+        d_tables = [torch.empty_like(table) if each_row_once else torch.zeros_like(table) for table in tables]
         d_centers = torch.empty_like(centers) if wants_center else tables[0].new_empty(CENTER_SLOTS)
         if count > 0:
-            programs = _programs(launch, count, device)
+            programs = _programs(launch, count, visible.device)
             partials = tables[0].new_empty(programs, len(packing.gather) + CENTER_SLOTS)
-            launch_backward(
-                (programs, 1, 1), *tables, visible, centers, packed,
+            backward_kernel[(programs,)](
+                *tables, visible, centers, packed,
                 _contiguous(d_colors), _contiguous(d_opacities), *d_tables, d_centers, partials,
-                count, *options.scalars, SLOTS=partials.shape[1], CENTER=wants_center,
-                GRADIENT_KIND=KINDS[options.precision][1], **_constants(packing, launch, options, one_center),
+                count, *ctx.scalars, SLOTS=partials.shape[1], CENTER=wants_center,
+                GRADIENT_KIND=KINDS[config.precision][1], **_constants(packing, launch, config, one_center),
             )  # fmt: skip
             sums = partials.sum(dim=0)
         else:
@@ -163,7 +145,7 @@ class FusedFunction(torch.autograd.Function):
             d_centers = sums[len(packing.gather) : len(packing.gather) + 3]
         flat = sums.index_select(0, packing.scatter).split([shape.numel() for shape in packing.shapes])
         d_weights = [d.view(shape) for d, shape in zip(flat, packing.shapes, strict=True)]
-        return None, None, None, *d_tables, None, d_centers if wants_center else None, *d_weights
+        return None, None, None, None, *d_tables, None, d_centers if wants_center else None, *d_weights
 
 
 def _packed(packing: Packing, weights: Sequence[Tensor]) -> Tensor:
@@ -172,7 +154,7 @@ def _packed(packing: Packing, weights: Sequence[Tensor]) -> Tensor:
     return torch.cat([*flat, _zero(flat[0].device)]).index_select(0, packing.gather)
 
 
-def _constants(packing: Packing, launch: Launch, options: FieldOptions, one_center: bool) -> dict[str, Any]:
+def _constants(packing: Packing, launch: Launch, config, one_center: bool) -> dict[str, Any]:
     """Constants of both kernels, and options of Triton's compiler."""
     return {
         "D": packing.latent_dim,
@@ -182,21 +164,21 @@ def _constants(packing: Packing, launch: Launch, options: FieldOptions, one_cent
         "B": launch.block,
         "COLUMNS": launch.columns,
         "ONE_CENTER": one_center,
-        "BOUND": options.bound,
-        "KIND": KINDS[options.precision][0],
+        "BOUND": config.bound,
+        "KIND": KINDS[config.precision][0],
         **launch.options(packing.hidden),
     }
 
 
-def first_that_runs(packing: Packing, options: FieldOptions) -> Launches:
-    """The fastest launches that this device can run at these sizes; else raise what goes wrong.
+def first_that_runs(packing: Packing, config) -> Launches:
+    """The fastest launches of an NrfConfig that this device can run at these sizes; else raise what goes wrong.
 
     A missing C compiler and a lack of shared memory show only here. Out-of-memory is re-raised: otherwise a slower
     launch would be kept for good.
     """
-    for launches in LAUNCHES[options.precision]:
+    for launches in LAUNCHES[config.precision]:
         try:
-            probe(packing, launches, options)
+            probe(packing, launches, config)
             return launches
         except torch.OutOfMemoryError:
             raise
@@ -205,13 +187,13 @@ def first_that_runs(packing: Packing, options: FieldOptions) -> Launches:
     raise reason
 
 
-def probe(packing: Packing, launches: Launches, options: FieldOptions) -> None:
+def probe(packing: Packing, launches: Launches, config) -> None:
     """Compile and run both kernels on one splat, for one camera; raise whatever goes wrong."""
     device = packing.gather.device
     tables = [torch.zeros(1, n, device=device, requires_grad=True) for n in (3, packing.latent_dim, 3, 1)]
     weights = [torch.zeros(shape, device=device, requires_grad=True) for shape in packing.shapes]
     visible, center = torch.zeros(1, dtype=torch.int64, device=device), torch.ones(3, device=device)
-    outputs = FusedFunction.apply(packing, launches, options, *tables, visible, center, *weights)
+    outputs = FusedFunction.apply(packing, launches, config, 1.0, *tables, visible, center, *weights)
     sum(output.sum() for output in outputs).backward()
 
 
@@ -219,20 +201,6 @@ def _programs(launch: Launch, count: int, device: torch.device) -> int:
     """Programs to launch: all that run at once, unless there are fewer blocks."""
     at_once = INTERPRETER_PROGRAMS if INTERPRETED.value else launch.programs_per_sm * _multiprocessors(device)
     return min(at_once, math.ceil(count / launch.block))
-
-
-def _tables(rows: int, latent_dim: int, device: torch.device, zero: bool) -> list[Tensor]:
-    """Tables [N, 3], [N, D], [N, 3] and [N, 1], cut from one allocation so that one launch clears them.
-
-    Each begins at a multiple of 16 bytes: Triton compiles another kernel for pointers that do not.
-    """
-    padded = -(-rows // 4) * 4
-    widths = (3, latent_dim, 3, 1)
-    whole = (torch.zeros if zero else torch.empty)(padded * sum(widths), device=device)
-    begins = (0, *itertools.accumulate(widths[:-1]))
-    return [
-        whole.as_strided((rows, width), (width, 1), padded * begin) for width, begin in zip(widths, begins, strict=True)
-    ]
 
 
 def _contiguous(x: Tensor) -> Tensor:

@@ -237,13 +237,8 @@ def _backward_block(
     return F.embedding_bag(row_of_slot[:-1], gradients, lists.splat_start, mode="sum")
 
 
-def leaves_out(*_) -> bool:
-    """Whether `composite` can leave out rows that are not finite."""
-    return False
-
-
 def composite(
-    projection: Projection, colors: Tensor, opacities: Tensor, backgrounds: Tensor | None, absgrad: bool, _: bool
+    projection: Projection, colors: Tensor, opacities: Tensor, backgrounds: Tensor | None, absgrad: bool
 ) -> tuple[Tensor, Tensor, dict]:
     """Render [C, H, W, D] over backgrounds [C, D], alphas [C, H, W, 1], and no lists to add to `info`."""
     tables = projection.means2d, projection.conics, opacities, colors
