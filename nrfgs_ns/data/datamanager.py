@@ -28,10 +28,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 from torch import Tensor
 
-from nrfgs_ns.data.cameras import LENS, undistorted_cameras
 from nrfgs_ns.data.checks import some, warn
 from nrfgs_ns.data.colmap_parser import checked
 from nrfgs_ns.data.dataparser import NrfgsDataParser, NrfgsDataParserConfig
+from nrfgs_ns.data.lenses import LENS, undistorted_cameras
 from nrfgs_ns.data.pictures import cache_folder, free_memory, in_parallel, read_mask, read_picture
 from nrfgs_ns.data.views import different_views, nearest_depth, scene_unit
 from nrfgs_ns.errors import InputError

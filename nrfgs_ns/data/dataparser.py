@@ -13,15 +13,21 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
-from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
+from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
+from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, Cameras, CameraType
+from nerfstudio.data.dataparsers.base_dataparser import (
+    DataParser,
+    DataparserOutputs,
+    transform_poses_to_original_space,
+)
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import MAX_AUTO_RESOLUTION, NerfstudioDataParserConfig
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from torch import Tensor
 
 from nrfgs_ns.data import checks
-from nrfgs_ns.data.cameras import SMALLEST, PlacedOutputs, after, applied_transform, read_cameras
-from nrfgs_ns.data.checks import find_colmap, shown, warn
+from nrfgs_ns.data.checks import PIXELS, SMALLEST, find_colmap, shown, warn
+from nrfgs_ns.data.lenses import check_distortions
 from nrfgs_ns.data.pictures import known_exif, read_size
 from nrfgs_ns.data.points import check_sight, in_reach, read_colmap, read_ply
 from nrfgs_ns.data.splits import SPLITS, STAND_INS, Named, Rows, split_by_names, split_by_rule
@@ -38,6 +44,12 @@ FOLDERS = {"file_path": "images", "mask_path": "masks"}
 """A frame's files -> folder of their smaller copies, followed by _ and the factor."""
 COLMAP_TO_FRAMES = torch.tensor([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
 """The applied_transform of data sets from before nerfstudio wrote it down."""
+ORIENTATIONS = ("pca", "up", "vertical", "none")
+FAR = 100.0
+"""Distance of the cameras' mean from the origin, in their extents, above which they are moved in float64. Nearer ones
+lose less than a hundredth of a pixel, and stay to the bit where nerfstudio puts them."""
+FISHEYE_AT_LEAST = 1e-12
+"""A distortion without effect, because nerfstudio undistorts only where some parameter is not 0."""
 
 
 @dataclass
@@ -66,11 +78,21 @@ class DataSet(NamedTuple):
     """size by the intrinsics / size of the images"""
     cameras: Cameras
     """placed, of the size of the images"""
-    transform: torch.Tensor
+    transform: Tensor
     """[3, 4], from the frames' world to the cameras', before `scale`"""
-    to_frames: torch.Tensor | None
+    to_frames: Tensor | None
     """[3, 4], from the original world to the frames'"""
     scale: float
+
+
+class PlacedOutputs(DataparserOutputs):
+    """nerfstudio's outputs, whose way back may be in float64."""
+
+    def transform_poses_to_original_space(self, poses: Tensor, camera_convention="opencv") -> Tensor:
+        way_back = self.dataparser_transform
+        return transform_poses_to_original_space(
+            poses.to(way_back.dtype), way_back, self.dataparser_scale, camera_convention=camera_convention
+        )
 
 
 class NrfgsDataParser(DataParser):
@@ -119,7 +141,7 @@ class NrfgsDataParser(DataParser):
         config = self.config
         checks.check_options(config)
         meta, source = self._read()
-        cameras, transform, scale = read_cameras(meta, source, config)
+        cameras, transform, scale = self._placed_cameras(meta, source)
         factor = self._factor(meta["frames"], source) if self.downscale_factor is None else self.downscale_factor
         splits = self._splits(meta, source)
         full_sizes = torch.cat([cameras.width, cameras.height], dim=1).tolist()
@@ -132,8 +154,29 @@ class NrfgsDataParser(DataParser):
             self._check_sizes(meta["frames"], source, factor, full_sizes, sizes)
         to_frames = COLMAP_TO_FRAMES if self._colmap.exists() else None
         if "applied_transform" in meta:
-            to_frames = applied_transform(meta, source)
+            to_frames = checks.applied_transform(meta, source)
         return DataSet(meta, source, splits, factor, cameras, transform, to_frames, scale)
+
+    def _placed_cameras(self, meta: dict[str, Any], source: Path) -> tuple[Cameras, Tensor, float]:
+        """The cameras [V] in full size, oriented, centred and scaled; the transform [3, 4] from the frames' world to
+        theirs, before scaling; and the scale, also of what was applied before."""
+        config, frames = self.config, meta["frames"]
+        lenses = checks.read_lenses(meta, source)
+        scaled = config.auto_scale_poses and len(frames) > 1
+        poses = checks.check_poses(frames, source, need_spread=scaled)
+        orientation = meta.get("orientation_override", config.orientation_method)
+        if orientation not in ORIENTATIONS:
+            fix = f"Use one of {', '.join(ORIENTATIONS)}, or remove it."
+            raise InputError(f"{source}: orientation_override is {shown(repr(orientation))}. {fix}")
+        placed, transform, scale = place(poses, orientation, config.center_method, scaled, config.scale_factor)
+        kind = CAMERA_MODEL_TO_TYPE[meta.get("camera_model", "OPENCV")]
+        if kind == CameraType.FISHEYE:
+            lenses[(lenses[:, len(PIXELS) :] == 0).all(axis=1), len(PIXELS)] = FISHEYE_AT_LEAST
+        check_distortions(lenses, kind, frames, source)
+        fx, fy, cx, cy, width, height = torch.from_numpy(lenses[:, : len(PIXELS)]).float().unbind(1)
+        distortion = torch.from_numpy(lenses[:, len(PIXELS) :]).float()
+        cameras = Cameras(placed, fx, fy, cx, cy, width.int(), height.int(), distortion, kind, metadata={})
+        return cameras, transform, scale * checks.applied_scale(meta, source)
 
     def _factor(self, frames: list[dict[str, Any]], source: Path) -> int:
         """The downscale factor, given or by the images' size; InputError if a file is missing at that size."""
@@ -208,7 +251,7 @@ class NrfgsDataParser(DataParser):
                 checks.check_headers(paths, full_sizes, kind, fix)
 
     @cached_property
-    def _placed_points(self) -> dict[str, torch.Tensor]:
+    def _placed_points(self) -> dict[str, Tensor]:
         """points3D_xyz float32 [N, 3] and points3D_rgb uint8 [N, 3] in the cameras' world; if too few, a warning."""
         data_set = self._data_set
         xyz, rgb, transform = self._points(data_set)
@@ -262,13 +305,61 @@ class NrfgsDataParser(DataParser):
         fields = {split: f"{split}_filenames" for split in SPLITS}
         return {split: (name, meta[name]) for split, name in fields.items() if name in meta}
 
-    def _points(self, data_set: DataSet) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
+    def _points(self, data_set: DataSet) -> tuple[np.ndarray, np.ndarray, Tensor]:
         """Positions and colours [N, 3] as stored, and the transform [3, 4] to the cameras' unscaled world."""
         if "ply_file_path" in data_set.meta:
             return *read_ply(self._file(str(data_set.meta["ply_file_path"]))), data_set.transform
         if self._colmap.is_dir():
             return *read_colmap(self._colmap), after(data_set.transform, data_set.to_frames)
         return *np.empty((2, 0, 3)), data_set.transform
+
+
+def place(
+    poses: np.ndarray, orientation: str, centering: str, auto_scale: bool, factor: float
+) -> tuple[Tensor, Tensor, float]:
+    """Orient, centre and scale camera-to-world poses, float64 [V, 4, 4], as nerfstudio does.
+
+    In float32, numbers near ten million are a metre apart. Cameras far from the origin, such as georeferenced ones, are
+    therefore moved there in float64 first, and the way back is float64, too.
+
+    Returns:
+        The poses, float32 [V, 3, 4]; the transform [3, 4] before scaling, float64 if they were far from the origin and
+        otherwise float32; and the scale.
+    """
+    if len(poses) == 1 and orientation == "vertical":  # needs two cameras
+        orientation = "up"
+    positions = poses[:, :3, 3]
+    center = positions.mean(axis=0)
+    extent = np.ptp(positions, axis=0).max()
+    far = centering != "none" and np.abs(center).max() > FAR * extent > 0
+    offset = rounded(center, extent) if far else np.zeros(3)
+    near = poses.copy()
+    near[:, :3, 3] -= offset
+    placed, transform = auto_orient_and_center_poses(
+        torch.from_numpy(near.astype(np.float32)), method=orientation, center_method=centering
+    )
+    if not torch.isfinite(transform).all():
+        raise InputError("The poses' up directions cancel. Give the parser --orientation-method none, or other poses.")
+    reach = float(torch.max(torch.abs(placed[:, :3, 3])))
+    scale = (1.0 / reach if auto_scale and reach > 0 else 1.0) * factor
+    placed[:, :3, 3] *= scale
+    if far:
+        transform = transform.double()
+        transform[:, 3] -= transform[:, :3] @ torch.from_numpy(offset)
+    return placed[:, :3, :4], transform, scale
+
+
+def rounded(place: np.ndarray, extent: float) -> np.ndarray:
+    """A place rounded to units, or to a power of two of the extent if that is less."""
+    step = min(1.0, 2.0 ** np.floor(np.log2(extent)))
+    return np.round(place / step) * step
+
+
+def after(transform: Tensor, earlier: Tensor | None) -> Tensor:
+    """The product [3, 4] of two transforms, in the first one's precision."""
+    if earlier is None:
+        return transform
+    return transform @ torch.cat([earlier.to(transform), torch.tensor([[0, 0, 0, 1]]).to(transform)], 0)
 
 
 def read_transforms(data: Path) -> tuple[dict[str, Any], Path]:

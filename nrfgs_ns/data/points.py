@@ -14,9 +14,9 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from plyfile import PlyData
 
-from nrfgs_ns.data.cameras import undistorted_cameras
 from nrfgs_ns.data.checks import shown, some, warn
 from nrfgs_ns.data.colmap import read_points
+from nrfgs_ns.data.lenses import undistorted_cameras
 from nrfgs_ns.data.views import in_view
 from nrfgs_ns.errors import InputError
 
