@@ -78,10 +78,10 @@ class DataSet(NamedTuple):
     """size by the intrinsics / size of the images"""
     cameras: Cameras
     """placed, of the size of the images"""
-    transform: Tensor
+    from_frames: Tensor
     """[3, 4], from the frames' world to the cameras', before `scale`"""
-    to_frames: Tensor | None
-    """[3, 4], from the original world to the frames'"""
+    from_original: Tensor
+    """[3, 4], the same from the original world, before an applied_transform"""
     scale: float
 
 
@@ -124,7 +124,7 @@ class NrfgsDataParser(DataParser):
             scene_box=SceneBox(aabb=torch.stack([-corner, corner])),
             mask_filenames=masks or None,
             dataparser_scale=data_set.scale,
-            dataparser_transform=after(data_set.transform, data_set.to_frames),
+            dataparser_transform=data_set.from_original,
             metadata={
                 "exif": [known_exif(frame.get("exif", {})) for frame in frames],
                 "factor": data_set.factor,
@@ -155,7 +155,10 @@ class NrfgsDataParser(DataParser):
         to_frames = COLMAP_TO_FRAMES if self._colmap.exists() else None
         if "applied_transform" in meta:
             to_frames = checks.applied_transform(meta, source)
-        return DataSet(meta, source, splits, factor, cameras, transform, to_frames, scale)
+        whole = transform
+        if to_frames is not None:
+            whole = transform @ torch.cat([to_frames.to(transform), torch.tensor([[0, 0, 0, 1]]).to(transform)], 0)
+        return DataSet(meta, source, splits, factor, cameras, transform, whole, scale)
 
     def _placed_cameras(self, meta: dict[str, Any], source: Path) -> tuple[Cameras, Tensor, float]:
         """The cameras [V] in full size, oriented, centred and scaled; the transform [3, 4] from the frames' world to
@@ -254,7 +257,11 @@ class NrfgsDataParser(DataParser):
     def _placed_points(self) -> dict[str, Tensor]:
         """points3D_xyz float32 [N, 3] and points3D_rgb uint8 [N, 3] in the cameras' world; if too few, a warning."""
         data_set = self._data_set
-        xyz, rgb, transform = self._points(data_set)
+        xyz, rgb, transform = *np.empty((2, 0, 3)), data_set.from_frames
+        if "ply_file_path" in data_set.meta:
+            xyz, rgb = read_ply(self._file(str(data_set.meta["ply_file_path"])))
+        elif self._colmap.is_dir():
+            xyz, rgb, transform = *read_colmap(self._colmap), data_set.from_original
         if len(xyz) < MIN_POINTS:
             finding = f"there are {len(xyz)} usable points (of ply_file_path, or in colmap/sparse/0)"
             warn(f"{data_set.source}: {finding}. Training starts from random points, which costs quality.")
@@ -305,14 +312,6 @@ class NrfgsDataParser(DataParser):
         fields = {split: f"{split}_filenames" for split in SPLITS}
         return {split: (name, meta[name]) for split, name in fields.items() if name in meta}
 
-    def _points(self, data_set: DataSet) -> tuple[np.ndarray, np.ndarray, Tensor]:
-        """Positions and colours [N, 3] as stored, and the transform [3, 4] to the cameras' unscaled world."""
-        if "ply_file_path" in data_set.meta:
-            return *read_ply(self._file(str(data_set.meta["ply_file_path"]))), data_set.transform
-        if self._colmap.is_dir():
-            return *read_colmap(self._colmap), after(data_set.transform, data_set.to_frames)
-        return *np.empty((2, 0, 3)), data_set.transform
-
 
 def place(
     poses: np.ndarray, orientation: str, centering: str, auto_scale: bool, factor: float
@@ -353,13 +352,6 @@ def rounded(place: np.ndarray, extent: float) -> np.ndarray:
     """A place rounded to units, or to a power of two of the extent if that is less."""
     step = min(1.0, 2.0 ** np.floor(np.log2(extent)))
     return np.round(place / step) * step
-
-
-def after(transform: Tensor, earlier: Tensor | None) -> Tensor:
-    """The product [3, 4] of two transforms, in the first one's precision."""
-    if earlier is None:
-        return transform
-    return transform @ torch.cat([earlier.to(transform), torch.tensor([[0, 0, 0, 1]]).to(transform)], 0)
 
 
 def read_transforms(data: Path) -> tuple[dict[str, Any], Path]:
