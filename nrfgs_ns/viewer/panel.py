@@ -93,14 +93,12 @@ class ViewerPanel(ViewerControl):
         background = self.background if self.model.config.background_color == "random" else None
         self.model.set_crop(obb_box)
         trace = sys.gettrace()  # nerfstudio's, which interrupts a rendering by an exception at any line
-        if not self.is_slow:
-            sys.settrace(None)
+        sys.settrace(trace if self.is_slow else None)
         try:
             return picture(self.model, camera, background=background, **self.options)
         finally:
             self.model.set_crop(None)
-            if not self.is_slow:
-                sys.settrace(trace)
+            sys.settrace(trace)
 
     @property
     def is_slow(self) -> bool:
