@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+import psutil
 import torch
 import tyro
 from nerfstudio.cameras.cameras import Cameras
@@ -31,7 +32,7 @@ from nrfgs_ns.data.checks import some, warn
 from nrfgs_ns.data.colmap_parser import checked
 from nrfgs_ns.data.dataparser import NrfgsDataParser, NrfgsDataParserConfig
 from nrfgs_ns.data.lenses import LENS, undistorted_cameras
-from nrfgs_ns.data.pictures import cache_folder, free_memory, in_parallel, read_mask, read_picture
+from nrfgs_ns.data.pictures import cache_folder, in_parallel, read_mask, read_picture
 from nrfgs_ns.data.views import different_views, nearest_depth, scene_unit
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import whole
@@ -195,7 +196,8 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         if torch.device(self.device).type == "cuda" and self.config.cache_images == "gpu":
             if size <= torch.cuda.mem_get_info(self.device)[0] / 2:
                 return "device"
-        budget = free_memory() / 2 if self.config.image_memory is None else 1e9 * self.config.image_memory
+        most = self.config.image_memory
+        budget = psutil.virtual_memory().available / 2 if most is None else 1e9 * most
         if size <= budget:
             return "memory"
         takes = f"Decoded images take {size / 1e9:.1f} GB, and may take {budget / 1e9:.1f}"

@@ -27,9 +27,10 @@ from torch import Tensor
 
 from nrfgs_ns.data import checks
 from nrfgs_ns.data.checks import PIXELS, SMALLEST, find_colmap, shown, warn
+from nrfgs_ns.data.colmap import read_points
 from nrfgs_ns.data.lenses import check_distortions
 from nrfgs_ns.data.pictures import known_exif, read_size
-from nrfgs_ns.data.points import check_sight, in_reach, read_colmap, read_ply
+from nrfgs_ns.data.points import check_sight, finite, in_reach, read_ply
 from nrfgs_ns.data.splits import SPLITS, STAND_INS, Named, Rows, split_by_names, split_by_rule
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.start import with_data_parsers
@@ -242,14 +243,13 @@ class NrfgsDataParser(DataParser):
     ) -> None:
         """Check that images and masks have the size of their cameras, or the full one without smaller copies."""
         for key, kind in FOLDERS.items():
-            if not (paths := self._files(frames, key, factor)):
-                continue
-            if self._has_copies(key, factor):
+            paths = self._files(frames, key, factor)
+            if paths and self._has_copies(key, factor):
                 checks.check_unique(paths, f"{source}: frames")
                 folder = self._copies(key, factor)
                 fix = f"Remove {folder}, or with `colmap` give --downscale-rounding-mode round or ceil."
                 checks.check_headers(paths, sizes, kind, fix)
-            else:
+            elif paths:
                 fix = "Use the images of the poses, or scale w, h, fl_x, fl_y, cx and cy with them; masks are as large."
                 checks.check_headers(paths, full_sizes, kind, fix)
 
@@ -261,7 +261,7 @@ class NrfgsDataParser(DataParser):
         if "ply_file_path" in data_set.meta:
             xyz, rgb = read_ply(self._file(str(data_set.meta["ply_file_path"])))
         elif self._colmap.is_dir():
-            xyz, rgb, transform = *read_colmap(self._colmap), data_set.from_original
+            xyz, rgb, transform = *finite(*read_points(self._colmap)), data_set.from_original
         if len(xyz) < MIN_POINTS:
             finding = f"there are {len(xyz)} usable points (of ply_file_path, or in colmap/sparse/0)"
             warn(f"{data_set.source}: {finding}. Training starts from random points, which costs quality.")
