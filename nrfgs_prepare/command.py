@@ -27,7 +27,6 @@ from nrfgs_ns.files import write_whole
 from nrfgs_prepare import pairs, structure
 from nrfgs_prepare import photos as files
 from nrfgs_prepare.pairs import Advance
-from nrfgs_prepare.scene import write_scene
 from nrfgs_prepare.structure import CameraModel
 
 STAGES = ("import", "features", "match", "map", "write")
@@ -173,6 +172,8 @@ class Run:
         self.stage("map", "find the cameras", self.model, len(self.names), find)
 
     def write(self) -> None:
+        from nrfgs_prepare.scene import write_scene  # imports torch
+
         write = partial(write_scene, self.model, self.stored, self.work / "undistorted", self.out)
         self.stage("write", "write the scene", self.out / "transforms.json", len(self.names), write)
 
