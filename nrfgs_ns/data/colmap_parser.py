@@ -53,12 +53,9 @@ class NrfgsColmapDataParser(NrfgsDataParser):
     def _root(self, key: str) -> Path:
         return self._folder / (self.config.images_path if key == "file_path" else self.config.masks_path)
 
-    def _file(self, name: str, key: str = "file_path") -> Path:
-        path = self._root(key) / name
+    def _path(self, name: str, key: str = "file_path", factor: int = 1) -> Path:
+        path = (self._root(key) if factor == 1 else self._copies(key, factor)) / name
         return path if key == "file_path" else path.with_suffix(".png")
-
-    def _copy(self, name: str, key: str, factor: int) -> Path:
-        return self._copies(key, factor) / self._file(name, key).relative_to(self._root(key))
 
     def _named_splits(self, meta: dict[str, Any]) -> Named:
         named = {}

@@ -186,8 +186,9 @@ class NrfgsDataParser(DataParser):
         """The downscale factor, given or by the images' size; InputError if a file is missing at that size."""
         factor = self.config.downscale_factor
         if factor is None:
-            checks.check_exist([self._file(frame["file_path"]) for frame in frames], source, "images")
-            factor = self._auto_factor(frames[0]["file_path"], max(read_size(self._file(frames[0]["file_path"]))))
+            paths = [self._path(frame["file_path"]) for frame in frames]
+            checks.check_exist(paths, source, "images")
+            factor = self._auto_factor(frames[0]["file_path"], max(read_size(paths[0])))
         for key in FOLDERS:
             kind = "images" if key == "file_path" else f"files of {key}"
             checks.check_exist(self._files(frames, key, factor), source, kind)
@@ -197,7 +198,7 @@ class NrfgsDataParser(DataParser):
         """The factor where none is given, by the first image and its longer side."""
         factor = 1
         while size / factor > MAX_AUTO_RESOLUTION and (
-            self._resizes or self._copy(first, "file_path", 2 * factor).exists()
+            self._resizes or self._path(first, "file_path", 2 * factor).exists()
         ):
             factor *= 2
         return factor
@@ -211,13 +212,13 @@ class NrfgsDataParser(DataParser):
 
     def _splits(self, meta: dict[str, Any], source: Path) -> Rows:
         """Rows of the training and the evaluation images, by the data set's own lists or by rule."""
-        paths = [self._file(frame["file_path"]) for frame in meta["frames"]]
+        paths = [self._path(frame["file_path"]) for frame in meta["frames"]]
         named = self._named_splits(meta)
         if named and "train" not in named:
             given, _ = next(iter(named.values()))  # such as test_filenames or test_list.txt
             raise InputError(f"{source} has {given}, but no train_{given.partition('_')[2]}. Name the training images.")
         splits = (
-            split_by_names(named, paths, self._file, source) if named else split_by_rule(self.config, paths, source)
+            split_by_names(named, paths, self._path, source) if named else split_by_rule(self.config, paths, source)
         )
         if not len(splits["train"]):
             raise InputError(f"{source}: no image left for training. Correct train_filenames or --eval-mode's options.")
@@ -225,10 +226,10 @@ class NrfgsDataParser(DataParser):
 
     def _files(self, frames: list[dict[str, Any]], key: str, factor: int) -> list[Path]:
         """Files of some frames, in full size or the data set's own smaller copies."""
-        names = [frame[key] for frame in frames if key in frame]
-        if names and self._has_copies(key, factor):
-            return [self._copy(name, key, factor) for name in names]
-        return [self._file(name, key) for name in names]
+        if key not in frames[0]:
+            return []
+        factor = factor if self._has_copies(key, factor) else 1
+        return [self._path(frame[key], key, factor) for frame in frames]
 
     def _has_copies(self, key: str, factor: int) -> bool:
         return factor > 1 and self._copies(key, factor).is_dir()
@@ -259,7 +260,7 @@ class NrfgsDataParser(DataParser):
         data_set = self._data_set
         xyz, rgb, transform = *np.empty((2, 0, 3)), data_set.from_frames
         if "ply_file_path" in data_set.meta:
-            xyz, rgb = read_ply(self._file(str(data_set.meta["ply_file_path"])))
+            xyz, rgb = read_ply(self._path(str(data_set.meta["ply_file_path"])))
         elif self._colmap.is_dir():
             xyz, rgb, transform = *finite(*read_points(self._colmap)), data_set.from_original
         if len(xyz) < MIN_POINTS:
@@ -282,7 +283,7 @@ class NrfgsDataParser(DataParser):
         in nerfstudio; and the file that messages name."""
         meta, source = read_transforms(self.config.data)
         checks.check_frames(meta["frames"], source)
-        meta["frames"].sort(key=lambda frame: self._file(frame["file_path"]).parts)
+        meta["frames"].sort(key=lambda frame: self._path(frame["file_path"]).parts)
         return meta, source
 
     @property
@@ -299,13 +300,9 @@ class NrfgsDataParser(DataParser):
         """Folder of one kind of files in full size, beside which smaller copies are."""
         return self._folder / FOLDERS[key]
 
-    def _file(self, name: str, key: str = "file_path") -> Path:
-        """A file of a frame, in full size."""
-        return self._folder / name
-
-    def _copy(self, name: str, key: str, factor: int) -> Path:
-        """Its copy at 1 / factor of the size, which need not be there."""
-        return self._copies(key, factor) / Path(name).name
+    def _path(self, name: str, key: str = "file_path", factor: int = 1) -> Path:
+        """A file of a frame, or its copy at 1 / factor of the size, which need not be there."""
+        return self._folder / name if factor == 1 else self._copies(key, factor) / Path(name).name
 
     def _named_splits(self, meta: dict[str, Any]) -> Named:
         """Splits listed by the data set itself."""
