@@ -188,27 +188,15 @@ class NrfgsDataParser(DataParser):
         if factor is None:
             paths = [self._path(frame["file_path"]) for frame in frames]
             checks.check_exist(paths, source, "images")
-            factor = self._auto_factor(frames[0]["file_path"], max(read_size(paths[0])))
+            size, factor = max(read_size(paths[0])), 1
+            while size / factor > MAX_AUTO_RESOLUTION and (
+                self._resizes or self._path(frames[0]["file_path"], "file_path", 2 * factor).exists()
+            ):
+                factor *= 2
         for key in FOLDERS:
             kind = "images" if key == "file_path" else f"files of {key}"
             checks.check_exist(self._files(frames, key, factor), source, kind)
         return factor
-
-    def _auto_factor(self, first: str, size: int) -> int:
-        """The factor where none is given, by the first image and its longer side."""
-        factor = 1
-        while size / factor > MAX_AUTO_RESOLUTION and (
-            self._resizes or self._path(first, "file_path", 2 * factor).exists()
-        ):
-            factor *= 2
-        return factor
-
-    @property
-    def training_factor(self) -> int:
-        """The downscale factor of a training, also where nerfstudio has set 1; without the images the given one."""
-        meta, cameras = self._data_set.meta, self._data_set.cameras
-        longer = int(max(cameras.width[0], cameras.height[0]))
-        return self.config.downscale_factor or self._auto_factor(meta["frames"][0]["file_path"], longer)
 
     def _splits(self, meta: dict[str, Any], source: Path) -> Rows:
         """Rows of the training and the evaluation images, by the data set's own lists or by rule."""
