@@ -345,7 +345,13 @@ def read_transforms(data: Path) -> tuple[dict[str, Any], Path]:
         raise InputError(f"{shown(str(data))}: no such file or folder. Check the path in --data or config.yml.")
     source = data if data.suffix == ".json" else data / "transforms.json"
     if not source.is_file():
-        raise InputError(f"{source} is missing. {_advice_without_transforms(data)}")
+        fix = (
+            "Point --data at a folder that holds one; `nrfgs prepare PHOTOS SCENE` makes one from photographs. Where "
+            "there is a transforms_train.json, put `blender-data` at the end of the command."
+        )
+        if data.is_dir() and (model := find_colmap(data)):
+            fix = f"There is a COLMAP model: put `colmap --colmap-path {model}` at the end of the command."
+        raise InputError(f"{source} is missing. {fix}")
     if source.stat().st_size > LONGEST_JSON:
         raise InputError(f"{source} is larger than {LONGEST_JSON} bytes. Make it anew.")
     try:
@@ -356,15 +362,6 @@ def read_transforms(data: Path) -> tuple[dict[str, Any], Path]:
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise InputError(f"{source}: `frames` must be a non-empty list of objects. Make the file anew.")
     return meta, source
-
-
-def _advice_without_transforms(folder: Path) -> str:
-    if folder.is_dir() and (model := find_colmap(folder)):
-        return f"There is a COLMAP model: put `colmap --colmap-path {model}` at the end of the command."
-    return (
-        "Point --data at a folder that holds one; `nrfgs prepare PHOTOS SCENE` makes one from photographs. Where there "
-        "is a transforms_train.json, put `blender-data` at the end of the command."
-    )
 
 
 nrfgs_dataparser = DataParserSpecification(
