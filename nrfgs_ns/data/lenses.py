@@ -57,22 +57,18 @@ def _undistorted(lens: np.ndarray, kind: CameraType) -> tuple[np.ndarray, np.nda
 def check_distortions(lenses: np.ndarray, kind: CameraType, frames: Sequence[dict[str, Any]], source: Path) -> None:
     """Check that undistorting leaves enough of the photographs, whose lenses are `checks.read_lenses`."""
     for lens, index in zip(*np.unique(lenses, axis=0, return_index=True), strict=True):
-        if lens[len(PIXELS) :].any():
-            _check_distortion(lens, kind, f"{source}: the distortion of {shown(frames[index]['file_path'])}")
-
-
-def _check_distortion(lens: np.ndarray, kind: CameraType, where: str) -> None:
-    """Check that undistorting leaves enough of the image."""
-    fx, fy, _, _, w, h, _, _, _, k4, _, _ = lens
-    K, distortion, flat, part = _undistorted(lens, kind)
-    enough = True
-    if kind != CameraType.FISHEYE:
-        if k4 != 0:
+        if not lens[len(PIXELS) :].any():
+            continue
+        where = f"{source}: the distortion of {shown(frames[index]['file_path'])}"
+        fx, fy, _, _, w, h, _, _, _, k4, _, _ = lens
+        if kind != CameraType.FISHEYE and k4 != 0:
             raise InputError(f"{where} has k4 = {k4:g}, which is for fisheyes. Set it to 0, or undistort the images.")
-        enough = part[2] * part[3] >= LEFT_OF_IMAGE * w * h and not _folds(K, distortion, (w, h), flat, part)
-    change = flat[[0, 1], [0, 1]] / (fx, fy)
-    if not (enough and ((LEAST_FOCAL < change) & (change < MOST_FOCAL)).all()):
-        raise InputError(f"{where} leaves next to nothing of the image. Correct it, or undistort the photographs.")
+        K, distortion, flat, part = _undistorted(lens, kind)
+        is_cut = part[2] * part[3] < LEFT_OF_IMAGE * w * h
+        enough = kind == CameraType.FISHEYE or not (is_cut or _folds(K, distortion, (w, h), flat, part))
+        change = flat[[0, 1], [0, 1]] / (fx, fy)
+        if not (enough and ((LEAST_FOCAL < change) & (change < MOST_FOCAL)).all()):
+            raise InputError(f"{where} leaves next to nothing of the image. Correct it, or undistort the photographs.")
 
 
 def _folds(K: np.ndarray, distortion: np.ndarray, size: tuple[int, int], flat: np.ndarray, part: Sequence[int]) -> bool:
