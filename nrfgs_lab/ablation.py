@@ -27,7 +27,7 @@ from nrfgs_ns.files import check_writable, write_whole
 from nrfgs_ns.image.metrics import psnr
 from nrfgs_ns.model.harmonics_fit import look_through
 from nrfgs_ns.progress import progress
-from nrfgs_ns.trained.find import NamesTraining
+from nrfgs_ns.trained.command import NamesTraining
 from nrfgs_ns.trained.loading import load_model
 
 TIMED = 5

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """`nrfgs prepare PHOTOS OUT`: the stages in order, their dependencies, and the verdict.
 
-`work/state.json` in OUT has the key of each stage that was begun: a digest of the input's bytes, the stage's options
-and the previous key. A finished stage with the same key is skipped, an unfinished one continues; files of another key
-are removed. Running a stage forgets the later ones.
+`prepare.json` in OUT has the verdict's numbers and the key of each stage that was begun: a digest of the input's bytes,
+the stage's options and the previous key. A finished stage with the same key is skipped, an unfinished one continues;
+files of another key are removed. Running a stage forgets the later ones.
 """
 
 import hashlib
@@ -80,25 +80,20 @@ class Run:
         self.is_video = options.photos.is_file()
         structure.colmap()  # reports a missing package before any work
         self.out, self.work = options.out, options.out / "work"
-        names = "photos", "features/database.db", "model", "state.json"
-        self.stored, self.database, self.model, self.state_file = map(self.work.joinpath, names)
-        self.verdict_file = self.out / "prepare.json"
+        names = "photos", "features/database.db", "model"
+        self.stored, self.database, self.model = map(self.work.joinpath, names)
+        self.file = file = self.out / "prepare.json"
         self.source = str(options.photos.resolve())
-        ours = self.state_file.is_file() or self.verdict_file.is_file()
-        if self.out.exists() and not ours and (self.out.is_file() or any(self.out.iterdir())):
+        if self.out.exists() and not file.is_file() and (self.out.is_file() or any(self.out.iterdir())):
             raise InputError(f"{self.out} exists and was not made by `nrfgs prepare`. Name a new or an empty folder.")
-        self.state = self._read(self.state_file)
-        made = self._read(self.verdict_file)
-        self.key = self.digest = files.digest(self.inputs)
-        if made.get("digest", self.digest) != self.digest and (other := made.get("source")) != self.source:
-            fix = "Name another folder, or delete this one."
-            raise InputError(f"{self.out} has the scene of other photographs, {other}. {fix}")
-
-    def _read(self, file: Path) -> dict[str, Any]:
         try:
-            return dict(json.loads(file.read_text())) if file.is_file() else {}
+            self.state: dict[str, Any] = dict(json.loads(file.read_text())) if file.is_file() else {}
         except (ValueError, TypeError) as error:
             raise InputError(f"{file} is damaged ({error}). Delete {self.out} and begin again.") from error
+        self.key = self.digest = files.digest(self.inputs)
+        if self.state.get("digest", self.digest) != self.digest and (other := self.state.get("source")) != self.source:
+            fix = "Name another folder, or delete this one."
+            raise InputError(f"{self.out} has the scene of other photographs, {other}. {fix}")
 
     def all(self) -> None:
         """Run every stage, and print the verdict."""
@@ -177,7 +172,7 @@ class Run:
         self.stage("map", "find the cameras", self.model, len(self.names), find)
 
     def write(self) -> None:
-        from nrfgs_prepare.scene import write_scene
+        from nrfgs_prepare.scene import write_scene  # imports torch
 
         write = partial(write_scene, self.model, self.stored, self.work / "undistorted", self.out)
         self.stage("write", "write the scene", self.out / "transforms.json", len(self.names), write)
@@ -201,14 +196,17 @@ class Run:
             work(lambda steps: progress.advance(task, steps))
             progress.update(task, completed=total)
         spent = [round(clock() - start, 1) for clock, start in zip(clocks, begun, strict=True)]
-        self.state.setdefault("seconds", {})[slot] = spent
+        self.state.setdefault("seconds_and_cpu_seconds", {})[slot] = spent
         self._remember(slot, done=True)
 
     def _remember(self, slot: str, done: bool) -> None:
         for later in STAGES[STAGES.index(slot) + 1 :]:
             self.state.pop(later, None)
-        self.state[slot] = {"key": self.key, "done": done}
-        write_whole(self.state_file, json.dumps(self.state, indent=1) + "\n")
+        self._save({slot: {"key": self.key, "done": done}})
+
+    def _save(self, more: dict[str, Any]) -> None:
+        self.state |= more
+        write_whole(self.file, json.dumps(self.state, indent=1) + "\n")
 
     def verdict(self) -> None:
         """Print results and the next step, and write the numbers to OUT/prepare.json."""
@@ -221,16 +219,11 @@ class Run:
             "photographs": total,
             "registered": registered,
             "points": model.num_points3D(),
-            "mean_reprojection_error_px": model.compute_mean_reprojection_error(),
+            "mean_reprojection_error_px": (error := model.compute_mean_reprojection_error()),
             "mean_track_length": model.compute_mean_track_length(),
-            "models": self.state["models"],
-            "mapping": self.state["mapping"],
-            "pairs": self.state["pairs"],
-            "seconds_and_cpu_seconds": self.state["seconds"],
             "options": {name: value for name, value in asdict(self.options).items() if name not in ("photos", "out")},
         }
-        write_whole(self.verdict_file, json.dumps(numbers, indent=1) + "\n")
-        error = numbers["mean_reprojection_error_px"]
+        self._save(numbers)
         cameras = [model.cameras[model.images[number].camera_id] for number in model.reg_image_ids()]
         shortest = min(camera.mean_focal_length() / max(camera.width, camera.height) for camera in cameras)
         found = f"{registered} of {total} photographs have a camera, {numbers['points']:,} points"

@@ -29,14 +29,13 @@ Pairs = list[tuple[int, int]]
 """Sorted pairs of indices, first < second."""
 
 
-def likely_pairs(alike: np.ndarray, positions: np.ndarray | None, in_a_row: bool) -> Pairs:
-    """Pairs worth matching, by `shared_features` [N, N], positions [N, 2] in metres (NaN where unknown), and whether
+def likely_pairs(alike: np.ndarray, positions: np.ndarray, in_a_row: bool) -> Pairs:
+    """Pairs worth matching, by `shared_features` [N, N], positions [N, 3] in metres (NaN where unknown), and whether
     photographs follow each other along a path."""
     count = len(alike)
     chosen = np.zeros((count, count), dtype=bool)
     _choose_best(chosen, np.where(alike > 0, alike, -np.inf), ALIKE)
-    if positions is not None:
-        _choose_best(chosen, -np.linalg.norm(positions[:, None] - positions[None], axis=-1), NEAREST)
+    _choose_best(chosen, -np.linalg.norm(positions[:, None] - positions[None], axis=-1), NEAREST)
     if in_a_row:
         for step in range(1, min(FOLLOWING, count - 1) + 1):
             chosen |= np.eye(count, k=step, dtype=bool)
@@ -79,10 +78,9 @@ def numbered_in_a_row(names: list[str]) -> bool:
     return sum(1 <= step <= LARGEST_GAP for step in steps) >= NUMBERED_SHARE * len(steps) > 0
 
 
-def metres(positions: np.ndarray) -> np.ndarray | None:
-    """Latitudes and longitudes [N, 2] in degrees, NaN where unknown, as metres east and north of their mean; None if
-    fewer than two are known."""
-    if np.isfinite(positions[:, 0]).sum() < 2:
-        return None
-    latitude, longitude = np.radians(positions - np.nanmean(positions, axis=0)).T
-    return 6_371_000.0 * np.stack([longitude * np.cos(np.radians(np.nanmean(positions[:, 0]))), latitude], axis=1)
+def metres(positions: np.ndarray) -> np.ndarray:
+    """Latitudes and longitudes [N, 2] in degrees, NaN where unknown, as places on a sphere, in metres from its middle,
+    [N, 3]."""
+    latitude, longitude = np.radians(positions).T
+    along = np.stack([np.cos(longitude), np.sin(longitude)], axis=1) * np.cos(latitude)[:, None]
+    return 6_371_000.0 * np.column_stack([along, np.sin(latitude)])

@@ -15,7 +15,7 @@ from nrfgs_ns import cli
 from nrfgs_ns.cli import commands, summary
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import check_writable, whole, write_whole
-from nrfgs_ns.trained.find import NamesTraining, config_of
+from nrfgs_ns.trained.command import NamesTraining, config_of
 
 RUN = """
 import sys

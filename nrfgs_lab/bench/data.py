@@ -22,7 +22,7 @@ from PIL import Image
 
 from nrfgs_lab.bench.spec import Scene
 from nrfgs_ns.data.checks import find_colmap
-from nrfgs_ns.data.colmap import read_model
+from nrfgs_ns.data.colmap import read_frames
 from nrfgs_ns.data.pictures import read_mask, read_picture
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.errors import InputError
@@ -179,7 +179,7 @@ def transforms_of(folder: Path) -> dict[str, Any]:
 
 def mirror_with_split(folder: Path, model: str, mirror: Path) -> None:
     """Link the content of `folder` into `mirror`, beside lists of training and test images; replace links elsewhere."""
-    names = sorted(view.name for view in read_model(folder / model)[1])
+    names = sorted(frame["file_path"] for frame in read_frames(folder / model)[0])
     if len(names) < 2:
         raise InputError(f"{folder / model} has {len(names)} images; one to train on and one to test are needed.")
     mirror.mkdir(parents=True, exist_ok=True)

@@ -32,9 +32,8 @@ from nerfstudio.utils import writer
 from torch import Tensor
 
 from nrfgs_lab.training_run import parse, set_up
-from nrfgs_ns.data.cameras import place
 from nrfgs_ns.data.datamanager import NrfgsDatamanager, NrfgsDatamanagerConfig, NrfgsInputDataset
-from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
+from nrfgs_ns.data.dataparser import NrfgsDataParserConfig, place
 from nrfgs_ns.data.views import different_views
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.model.model import NrfgsModel

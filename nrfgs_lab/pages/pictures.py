@@ -97,7 +97,7 @@ def modes(config: Path, view: int = 1) -> None:
     size = WIDTH, round(WIDTH * camera.height.item() / camera.width.item())
     shown = []
     for name in viewed.legends(model.field):
-        rgb = viewed.picture(model, camera, viewed.PictureOptions(name))["rgb"]
+        rgb = viewed.picture(model, camera, name)["rgb"]
         shown.append((name, picture(rgb.cpu()).resize(size, Image.Resampling.LANCZOS)))
     result = sheet([shown[first : first + COLUMNS] for first in range(0, len(shown), COLUMNS)])
     result.save(IMAGES / "viewer-modes.jpg", quality=88)

@@ -2,7 +2,6 @@
 """Time of a training step, frames per second and peak memory against numbers of splats and pixels, for five renderers.
 
     python -m nrfgs_lab.timing.scale --out scale.jsonl [--config TRAINING/config.yml]
-    python -m nrfgs_lab.timing.scale --out scale.jsonl --table
 
 All have the same splats, cameras and photographs, and growth has ended: discs on surfaces in a ring of cameras, or a
 training's splats, thinned or repeated, and its cameras. `gsplat` and `faster-gs` are bare: no loader, but Adam and this
@@ -21,7 +20,6 @@ from importlib.util import find_spec
 from itertools import product
 from operator import itemgetter
 from pathlib import Path
-from statistics import median
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -39,7 +37,6 @@ from torch.profiler import ProfilerActivity, profile
 from nrfgs_lab.bench.measure import at_size, frames_per_second
 from nrfgs_lab.bench.run import host_without_downloads
 from nrfgs_lab.bench.spec import QUIET
-from nrfgs_lab.bench.table import grid
 from nrfgs_lab.training_run import machine, parse, set_up, synchronize
 from nrfgs_ns.data.views import evenly_spaced
 from nrfgs_ns.files import write_whole
@@ -260,12 +257,9 @@ class Scale:
     frames: tuple[str, ...] = tuple(FRAMES)  # sizes for frames per second, beside the first of megapixels
     repeats: int = 3
     steps: int = 100  # on the clock
-    table: bool = False  # print what is there as Markdown, and measure nothing
 
     def main(self) -> None:
         records = lines_of(self.out)
-        if self.table:
-            return print(as_table(records))
         device = "cuda" if torch.cuda.is_available() else "cpu"
         done = {cell_of(record) for record in records}
         needs = {of: BARE.get(of, "nerfstudio") for of in self.methods}
@@ -320,22 +314,6 @@ def add_line(file: Path, records: list[dict], cell: dict[str, Any], measure: Cal
         records[-1]["failed"] = str(error).partition("\n")[0]
     write_whole(file, "".join(json.dumps(record) + "\n" for record in records))
     print(records[-1], flush=True)
-
-
-def as_table(records: list[dict[str, Any]]) -> str:
-    """Markdown with the median of the repeats, and the least and the most."""
-    columns = "step_ms", "gpu_ms", "peak_mb", *FRAMES
-    groups = {}
-    for record in records:
-        groups.setdefault(cell_of(record)[:3], []).append(record)
-    lines = []
-    for (count, megapixels, method), same in sorted(groups.items(), key=lambda group: group[0][:2]):
-        lines.append([f"{count:,}", f"{megapixels:g}", method])
-        for column in columns:
-            values = [record[column] for record in same if record.get(column)]
-            text = f"{median(values):.4g} ({min(values):.4g} to {max(values):.4g})" if values else ""
-            lines[-1].append(text or next((record["failed"] for record in same if "failed" in record), ""))
-    return grid([*CELL[:3], *columns], lines)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ the row's earlier columns; its widths b_k grow with the neighbours' distances fr
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,7 +27,7 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor, nn
 from torch.nn.functional import logsigmoid
 
-from nrfgs_ns.appearance.head import Field, SplatAppearance, ViewNoise
+from nrfgs_ns.appearance.head import Field, ViewNoise
 from nrfgs_ns.appearance.reduce import latent_basis, with_components, with_rank
 from nrfgs_ns.compact.encode import drawable
 from nrfgs_ns.compact.tables import COLUMNS, MOST_BITS, Grid, morton, splats_of, steps_of, tables_of
@@ -35,7 +35,6 @@ from nrfgs_ns.data.views import camera_spacing
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.model.harmonics_fit import look_through
 from nrfgs_ns.model.loss import photometric
-from nrfgs_ns.rasterizer import View
 
 EVERY = 4
 """Steps between two counts of the bits, which take longer than an image."""
@@ -180,17 +179,6 @@ class CodedSplats(nn.Module):
         return torch.cat([tables[name] for name in COLUMNS], dim=-1)
 
 
-class Gated(NamedTuple):
-    """A field whose opacities are multiplied by gates [N]."""
-
-    field: Field
-    gates: Tensor
-
-    def seen_from(self, view: View) -> SplatAppearance:
-        appearance = self.field.seen_from(view)
-        return appearance._replace(opacities=appearance.opacities * self.gates[view.visible])
-
-
 def growth_without(model, field: Field, views: Iterable[tuple[Any, dict[str, Any]]]) -> tuple[Tensor, float]:
     """Growth of the views' squared error when one splat is removed, as a share of it, for each splat [N]; and the mean
     of the training's loss.
@@ -212,7 +200,10 @@ def growth_without(model, field: Field, views: Iterable[tuple[Any, dict[str, Any
     growth, error, loss = (torch.zeros(n, device=device) for n in (count, 1, 1))
     for number, (camera, batch) in enumerate(views, 1):
         gates = torch.ones(count, device=device, requires_grad=True)
-        outputs = model.render(field, camera, Gated(field, gates))
+        view = model.project(camera, field.splats)
+        seen = field.seen_from(view)
+        gated = seen._replace(opacities=seen.opacities * gates[view.visible])
+        outputs, _ = model.composite(view, gated, look=model.look_of(camera.metadata["cam_idx"]))
         off = outputs["rgb"] - model.truth_of(batch, outputs["background"])
         if (mask := model.mask_of(batch)) is not None:
             off = off * mask

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""COLMAP models, binary or text (https://colmap.github.io/format.html). A damaged file raises InputError.
+"""COLMAP models, binary or text (https://colmap.github.io/format.html), as frames of a transforms.json, and points. A
+damaged file raises InputError.
 
 nerfstudio's readers are used for cameras and for points in text. Its readers of images cut names at blanks, and its
 binary ones of images and points reserve gigabytes where a damaged file announces many features.
@@ -7,8 +8,9 @@ binary ones of images and points reserve gigabytes where a damaged file announce
 
 import struct
 from collections.abc import Callable, Sequence
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 from nerfstudio.data.utils import colmap_parsing_utils as nerfstudio_colmap
@@ -22,28 +24,17 @@ QUATERNION_TOLERANCE = 1e-2
 EXPORT = "Export the COLMAP model again."
 
 
-class Photograph(NamedTuple):
-    """One photograph of a model."""
-
-    id: int
-    name: str
-    camera: int
-    world_to_camera: np.ndarray
-    """float64 [4, 4], y down, z forwards"""
-
-
-def read_model(folder: Path) -> tuple[dict[int, dict[str, Any]], list[Photograph], Path]:
-    """Cameras by id (camera_model, w, h and parameters, named as in transforms.json), photographs in the order of their
-    ids, and the file of the photographs; InputError also where a camera model cannot be undistorted."""
+def read_frames(folder: Path) -> tuple[list[dict[str, Any]], Path]:
+    """The photographs in the order of their ids, as frames of a transforms.json in COLMAP's world, and their file;
+    InputError also where a camera model cannot be undistorted."""
     path = _file(folder, "cameras")
     read = nerfstudio_colmap.read_cameras_text if path.suffix == ".txt" else nerfstudio_colmap.read_cameras_binary
     cameras = {id: _lens(camera, path) for id, camera in _read(read, path).items()}
     path = path.with_stem("images")
     photographs = _read(_images_text, path) if path.suffix == ".txt" else _read(_entries, path, _image)
-    photographs.sort(key=lambda photograph: photograph.id)
-    if not photographs or any(photograph.camera not in cameras for photograph in photographs):
+    if not photographs or any(frame["camera"] not in cameras for frame in photographs):
         raise InputError(f"{path} holds no photograph, or one whose camera is missing. {EXPORT}")
-    return cameras, photographs, path
+    return [frame | cameras[frame["camera"]] for frame in sorted(photographs, key=itemgetter("id"))], path
 
 
 def read_points(folder: Path) -> tuple[np.ndarray, np.ndarray, Path]:
@@ -85,26 +76,27 @@ def _lens(camera: Any, path: Path) -> dict[str, Any]:
         ) from error
 
 
-def _photograph(id: int, pose: Sequence[float], camera: int, name: str) -> Photograph:
-    """A photograph with a pose of a unit quaternion and a position."""
+def _frame(id: int, pose: Sequence[float], camera: int, name: str) -> dict[str, Any]:
+    """A frame (y up, z backwards) by COLMAP's pose (y down, z forwards): a unit quaternion and a position."""
     quaternion, position = np.split(np.array(pose, dtype=np.float64).reshape(7), [4])
     if not (abs(np.linalg.norm(quaternion) - 1) <= QUATERNION_TOLERANCE and np.isfinite(position).all()):
         raise ValueError(f"the pose of {name} holds NaN or Inf, or a quaternion that is not of length 1")
     world_to_camera = np.eye(4)
     world_to_camera[:3, :3] = nerfstudio_colmap.qvec2rotmat(quaternion)
     world_to_camera[:3, 3] = position
-    return Photograph(id, name, camera, world_to_camera)
+    camera_to_world = np.linalg.inv(world_to_camera) * (1.0, -1.0, -1.0, 1.0)
+    return {"file_path": name, "id": id, "camera": camera, "transform_matrix": camera_to_world}
 
 
-def _images_text(path: Path) -> list[Photograph]:
-    photographs = []
+def _images_text(path: Path) -> list[dict[str, Any]]:
+    frames = []
     lines = iter(path.read_text(encoding="utf-8").splitlines())
     for line in lines:
         if line.strip() and not line.lstrip().startswith("#"):
             id, *pose, camera, name = line.split(maxsplit=9)
-            photographs.append(_photograph(int(id), pose, int(camera), name.strip()))
+            frames.append(_frame(int(id), pose, int(camera), name.strip()))
             next(lines, None)  # features
-    return photographs
+    return frames
 
 
 def _entries(path: Path, read: Callable[[BinaryIO], Any]) -> list[Any]:
@@ -116,11 +108,11 @@ def _entries(path: Path, read: Callable[[BinaryIO], Any]) -> list[Any]:
     return entries
 
 
-def _image(file: BinaryIO) -> Photograph:
+def _image(file: BinaryIO) -> dict[str, Any]:
     id, *pose, camera = _take(file, "<i7di")
     name = b"".join(iter(lambda: _take(file, "c")[0], b"\0")).decode("utf-8")
     file.seek(24 * _take(file, "<Q")[0], 1)  # features
-    return _photograph(id, pose, camera, name)
+    return _frame(id, pose, camera, name)
 
 
 def _point(file: BinaryIO) -> tuple:

@@ -12,7 +12,7 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
 from nrfgs_ns.data.checks import check_frames, shown
-from nrfgs_ns.data.colmap import read_model
+from nrfgs_ns.data.colmap import read_frames
 from nrfgs_ns.data.dataparser import NrfgsDataParser
 from nrfgs_ns.data.splits import Named
 from nrfgs_ns.errors import InputError
@@ -34,21 +34,15 @@ class NrfgsColmapDataParser(NrfgsDataParser):
         config = self.config
         if not os.path.exists(config.data):
             raise InputError(f"{shown(str(config.data))}: no such folder. Check the path in --data or config.yml.")
-        cameras, photographs, source = read_model(self._colmap)
-        kinds = {cameras[photograph.camera]["camera_model"] for photograph in photographs}
+        frames, source = read_frames(self._colmap)
+        kinds = {frame["camera_model"] for frame in frames}
         if len(kinds) > 1:
             raise InputError(f"{source}: some cameras are fisheyes and some are not. Undistort the photographs.")
         upright = UPRIGHT if config.assume_colmap_world_coordinate_convention else np.eye(4)
-        flip = np.array([1.0, -1.0, -1.0, 1.0])  # y up, z backwards
-        frames = [
-            {
-                "file_path": photograph.name,
-                **cameras[photograph.camera],
-                "transform_matrix": upright @ np.linalg.inv(photograph.world_to_camera) * flip,
-                **({} if config.masks_path is None else {"mask_path": photograph.name}),
-            }
-            for photograph in photographs
-        ]
+        for frame in frames:
+            frame["transform_matrix"] = upright @ frame["transform_matrix"]
+            if config.masks_path is not None:
+                frame["mask_path"] = frame["file_path"]
         check_frames(frames, source)
         return {"frames": frames, "camera_model": kinds.pop(), "applied_transform": upright[:3].tolist()}, source
 
@@ -59,12 +53,9 @@ class NrfgsColmapDataParser(NrfgsDataParser):
     def _root(self, key: str) -> Path:
         return self._folder / (self.config.images_path if key == "file_path" else self.config.masks_path)
 
-    def _file(self, name: str, key: str = "file_path") -> Path:
-        path = self._root(key) / name
+    def _path(self, name: str, key: str = "file_path", factor: int = 1) -> Path:
+        path = (self._root(key) if factor == 1 else self._copies(key, factor)) / name
         return path if key == "file_path" else path.with_suffix(".png")
-
-    def _copy(self, name: str, key: str, factor: int) -> Path:
-        return self._copies(key, factor) / self._file(name, key).relative_to(self._root(key))
 
     def _named_splits(self, meta: dict[str, Any]) -> Named:
         named = {}

@@ -4,7 +4,6 @@ without an accelerator, and to continue after an interruption."""
 
 import hashlib
 import json
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+import psutil
 import torch
 import tyro
 from nerfstudio.cameras.cameras import Cameras
@@ -28,19 +28,17 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 from torch import Tensor
 
-from nrfgs_ns.data.cameras import LENS, undistorted_cameras
 from nrfgs_ns.data.checks import some, warn
 from nrfgs_ns.data.colmap_parser import checked
 from nrfgs_ns.data.dataparser import NrfgsDataParser, NrfgsDataParserConfig
-from nrfgs_ns.data.pictures import cache_folder, free_memory, in_parallel, read_mask, read_picture
+from nrfgs_ns.data.lenses import LENS, undistorted_cameras
+from nrfgs_ns.data.pictures import cache_folder, in_parallel, read_mask, read_picture
 from nrfgs_ns.data.views import different_views, nearest_depth, scene_unit
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import whole
 
 IMAGES = "image", "mask"
 """What a photograph has in files."""
-PAGE = 4096
-"""Bytes of a page of memory."""
 WITH_POINTS = {"nerfstudio-data": NerfstudioDataParserConfig(load_3D_points=True)}
 DataParsers = tyro.conf.OmitSubcommandPrefixes[
     tyro.extras.subcommand_type_from_defaults(all_dataparsers | WITH_POINTS, prefix_names=False)
@@ -132,8 +130,6 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
             raise InputError(f"--pipeline.datamanager.image-memory is {memory}. Give 0 or more gigabytes.")
         self._views: dict[int, Cameras] = {}
         """training cameras by index, kept since moving one to a GPU takes as long as a step"""
-        self._reader = ThreadPoolExecutor(1)
-        """reads the next image while this one is trained on"""
         try:
             super().__init__(config, *args, **kwargs)
         except (OSError, LookupError, AttributeError, AssertionError, TypeError, ValueError) as error:
@@ -176,8 +172,6 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         index = self.train_unseen_cameras.pop(0)
         if len(self.train_unseen_cameras) == 0:
             self.train_unseen_cameras = self.sample_train_cameras()
-        if self._storage == "files":
-            self._reader.submit(read_pages, self.cached_train[self.train_unseen_cameras[0]]["image"])
         return index
 
     def _image(self, index: int) -> dict[str, Any]:
@@ -202,7 +196,8 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         if torch.device(self.device).type == "cuda" and self.config.cache_images == "gpu":
             if size <= torch.cuda.mem_get_info(self.device)[0] / 2:
                 return "device"
-        budget = free_memory() / 2 if self.config.image_memory is None else 1e9 * self.config.image_memory
+        most = self.config.image_memory
+        budget = psutil.virtual_memory().available / 2 if most is None else 1e9 * most
         if size <= budget:
             return "memory"
         takes = f"Decoded images take {size / 1e9:.1f} GB, and may take {budget / 1e9:.1f}"
@@ -268,11 +263,6 @@ def from_cache(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
             raise InputError(f"{path} cannot be written ({error}). {fix}") from error
         content = torch.load(path, mmap=True, weights_only=True)
     return {"image_idx": index} | {name: content[name] for name in IMAGES if name in content}
-
-
-def read_pages(image: Tensor) -> None:
-    """Read one byte of each page of a mapped image, so that it is in memory."""
-    image.view(torch.uint8).flatten()[::PAGE].sum()
 
 
 def _cache_file(dataset: Any, index: int, image_type: str) -> Path:

@@ -13,17 +13,24 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
-from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
+from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
+from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, Cameras, CameraType
+from nerfstudio.data.dataparsers.base_dataparser import (
+    DataParser,
+    DataparserOutputs,
+    transform_poses_to_original_space,
+)
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import MAX_AUTO_RESOLUTION, NerfstudioDataParserConfig
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from torch import Tensor
 
 from nrfgs_ns.data import checks
-from nrfgs_ns.data.cameras import SMALLEST, PlacedOutputs, after, applied_transform, read_cameras
-from nrfgs_ns.data.checks import find_colmap, shown, warn
+from nrfgs_ns.data.checks import PIXELS, SMALLEST, find_colmap, shown, warn
+from nrfgs_ns.data.colmap import read_points
+from nrfgs_ns.data.lenses import check_distortions
 from nrfgs_ns.data.pictures import known_exif, read_size
-from nrfgs_ns.data.points import check_sight, in_reach, read_colmap, read_ply
+from nrfgs_ns.data.points import check_sight, finite, in_reach, read_ply
 from nrfgs_ns.data.splits import SPLITS, STAND_INS, Named, Rows, split_by_names, split_by_rule
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.start import with_data_parsers
@@ -38,6 +45,12 @@ FOLDERS = {"file_path": "images", "mask_path": "masks"}
 """A frame's files -> folder of their smaller copies, followed by _ and the factor."""
 COLMAP_TO_FRAMES = torch.tensor([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
 """The applied_transform of data sets from before nerfstudio wrote it down."""
+ORIENTATIONS = ("pca", "up", "vertical", "none")
+FAR = 100.0
+"""Distance of the cameras' mean from the origin, in their extents, above which they are moved in float64. Nearer ones
+lose less than a hundredth of a pixel, and stay to the bit where nerfstudio puts them."""
+FISHEYE_AT_LEAST = 1e-12
+"""A distortion without effect, because nerfstudio undistorts only where some parameter is not 0."""
 
 
 @dataclass
@@ -66,11 +79,21 @@ class DataSet(NamedTuple):
     """size by the intrinsics / size of the images"""
     cameras: Cameras
     """placed, of the size of the images"""
-    transform: torch.Tensor
+    from_frames: Tensor
     """[3, 4], from the frames' world to the cameras', before `scale`"""
-    to_frames: torch.Tensor | None
-    """[3, 4], from the original world to the frames'"""
+    from_original: Tensor
+    """[3, 4], the same from the original world, before an applied_transform"""
     scale: float
+
+
+class PlacedOutputs(DataparserOutputs):
+    """nerfstudio's outputs, whose way back may be in float64."""
+
+    def transform_poses_to_original_space(self, poses: Tensor, camera_convention="opencv") -> Tensor:
+        way_back = self.dataparser_transform
+        return transform_poses_to_original_space(
+            poses.to(way_back.dtype), way_back, self.dataparser_scale, camera_convention=camera_convention
+        )
 
 
 class NrfgsDataParser(DataParser):
@@ -102,7 +125,7 @@ class NrfgsDataParser(DataParser):
             scene_box=SceneBox(aabb=torch.stack([-corner, corner])),
             mask_filenames=masks or None,
             dataparser_scale=data_set.scale,
-            dataparser_transform=after(data_set.transform, data_set.to_frames),
+            dataparser_transform=data_set.from_original,
             metadata={
                 "exif": [known_exif(frame.get("exif", {})) for frame in frames],
                 "factor": data_set.factor,
@@ -119,7 +142,7 @@ class NrfgsDataParser(DataParser):
         config = self.config
         checks.check_options(config)
         meta, source = self._read()
-        cameras, transform, scale = read_cameras(meta, source, config)
+        cameras, transform, scale = self._placed_cameras(meta, source)
         factor = self._factor(meta["frames"], source) if self.downscale_factor is None else self.downscale_factor
         splits = self._splits(meta, source)
         full_sizes = torch.cat([cameras.width, cameras.height], dim=1).tolist()
@@ -132,45 +155,58 @@ class NrfgsDataParser(DataParser):
             self._check_sizes(meta["frames"], source, factor, full_sizes, sizes)
         to_frames = COLMAP_TO_FRAMES if self._colmap.exists() else None
         if "applied_transform" in meta:
-            to_frames = applied_transform(meta, source)
-        return DataSet(meta, source, splits, factor, cameras, transform, to_frames, scale)
+            to_frames = checks.applied_transform(meta, source)
+        whole = transform
+        if to_frames is not None:
+            whole = transform @ torch.cat([to_frames.to(transform), torch.tensor([[0, 0, 0, 1]]).to(transform)], 0)
+        return DataSet(meta, source, splits, factor, cameras, transform, whole, scale)
+
+    def _placed_cameras(self, meta: dict[str, Any], source: Path) -> tuple[Cameras, Tensor, float]:
+        """The cameras [V] in full size, oriented, centred and scaled; the transform [3, 4] from the frames' world to
+        theirs, before scaling; and the scale, also of what was applied before."""
+        config, frames = self.config, meta["frames"]
+        lenses = checks.read_lenses(meta, source)
+        scaled = config.auto_scale_poses and len(frames) > 1
+        poses = checks.check_poses(frames, source, need_spread=scaled)
+        orientation = meta.get("orientation_override", config.orientation_method)
+        if orientation not in ORIENTATIONS:
+            fix = f"Use one of {', '.join(ORIENTATIONS)}, or remove it."
+            raise InputError(f"{source}: orientation_override is {shown(repr(orientation))}. {fix}")
+        placed, transform, scale = place(poses, orientation, config.center_method, scaled, config.scale_factor)
+        kind = CAMERA_MODEL_TO_TYPE[meta.get("camera_model", "OPENCV")]
+        if kind == CameraType.FISHEYE:
+            lenses[(lenses[:, len(PIXELS) :] == 0).all(axis=1), len(PIXELS)] = FISHEYE_AT_LEAST
+        check_distortions(lenses, kind, frames, source)
+        fx, fy, cx, cy, width, height = torch.from_numpy(lenses[:, : len(PIXELS)]).float().unbind(1)
+        distortion = torch.from_numpy(lenses[:, len(PIXELS) :]).float()
+        cameras = Cameras(placed, fx, fy, cx, cy, width.int(), height.int(), distortion, kind, metadata={})
+        return cameras, transform, scale * checks.applied_scale(meta, source)
 
     def _factor(self, frames: list[dict[str, Any]], source: Path) -> int:
         """The downscale factor, given or by the images' size; InputError if a file is missing at that size."""
         factor = self.config.downscale_factor
         if factor is None:
-            checks.check_exist([self._file(frame["file_path"]) for frame in frames], source, "images")
-            factor = self._auto_factor(frames[0]["file_path"], max(read_size(self._file(frames[0]["file_path"]))))
+            paths = [self._path(frame["file_path"]) for frame in frames]
+            checks.check_exist(paths, source, "images")
+            size, factor = max(read_size(paths[0])), 1
+            while size / factor > MAX_AUTO_RESOLUTION and (
+                self._resizes or self._path(frames[0]["file_path"], "file_path", 2 * factor).exists()
+            ):
+                factor *= 2
         for key in FOLDERS:
             kind = "images" if key == "file_path" else f"files of {key}"
             checks.check_exist(self._files(frames, key, factor), source, kind)
         return factor
 
-    def _auto_factor(self, first: str, size: int) -> int:
-        """The factor where none is given, by the first image and its longer side."""
-        factor = 1
-        while size / factor > MAX_AUTO_RESOLUTION and (
-            self._resizes or self._copy(first, "file_path", 2 * factor).exists()
-        ):
-            factor *= 2
-        return factor
-
-    @property
-    def training_factor(self) -> int:
-        """The downscale factor of a training, also where nerfstudio has set 1; without the images the given one."""
-        meta, cameras = self._data_set.meta, self._data_set.cameras
-        longer = int(max(cameras.width[0], cameras.height[0]))
-        return self.config.downscale_factor or self._auto_factor(meta["frames"][0]["file_path"], longer)
-
     def _splits(self, meta: dict[str, Any], source: Path) -> Rows:
         """Rows of the training and the evaluation images, by the data set's own lists or by rule."""
-        paths = [self._file(frame["file_path"]) for frame in meta["frames"]]
+        paths = [self._path(frame["file_path"]) for frame in meta["frames"]]
         named = self._named_splits(meta)
         if named and "train" not in named:
             given, _ = next(iter(named.values()))  # such as test_filenames or test_list.txt
             raise InputError(f"{source} has {given}, but no train_{given.partition('_')[2]}. Name the training images.")
         splits = (
-            split_by_names(named, paths, self._file, source) if named else split_by_rule(self.config, paths, source)
+            split_by_names(named, paths, self._path, source) if named else split_by_rule(self.config, paths, source)
         )
         if not len(splits["train"]):
             raise InputError(f"{source}: no image left for training. Correct train_filenames or --eval-mode's options.")
@@ -178,10 +214,10 @@ class NrfgsDataParser(DataParser):
 
     def _files(self, frames: list[dict[str, Any]], key: str, factor: int) -> list[Path]:
         """Files of some frames, in full size or the data set's own smaller copies."""
-        names = [frame[key] for frame in frames if key in frame]
-        if names and self._has_copies(key, factor):
-            return [self._copy(name, key, factor) for name in names]
-        return [self._file(name, key) for name in names]
+        if key not in frames[0]:
+            return []
+        factor = factor if self._has_copies(key, factor) else 1
+        return [self._path(frame[key], key, factor) for frame in frames]
 
     def _has_copies(self, key: str, factor: int) -> bool:
         return factor > 1 and self._copies(key, factor).is_dir()
@@ -196,22 +232,25 @@ class NrfgsDataParser(DataParser):
     ) -> None:
         """Check that images and masks have the size of their cameras, or the full one without smaller copies."""
         for key, kind in FOLDERS.items():
-            if not (paths := self._files(frames, key, factor)):
-                continue
-            if self._has_copies(key, factor):
+            paths = self._files(frames, key, factor)
+            if paths and self._has_copies(key, factor):
                 checks.check_unique(paths, f"{source}: frames")
                 folder = self._copies(key, factor)
                 fix = f"Remove {folder}, or with `colmap` give --downscale-rounding-mode round or ceil."
                 checks.check_headers(paths, sizes, kind, fix)
-            else:
+            elif paths:
                 fix = "Use the images of the poses, or scale w, h, fl_x, fl_y, cx and cy with them; masks are as large."
                 checks.check_headers(paths, full_sizes, kind, fix)
 
     @cached_property
-    def _placed_points(self) -> dict[str, torch.Tensor]:
+    def _placed_points(self) -> dict[str, Tensor]:
         """points3D_xyz float32 [N, 3] and points3D_rgb uint8 [N, 3] in the cameras' world; if too few, a warning."""
         data_set = self._data_set
-        xyz, rgb, transform = self._points(data_set)
+        xyz, rgb, transform = *np.empty((2, 0, 3)), data_set.from_frames
+        if "ply_file_path" in data_set.meta:
+            xyz, rgb = read_ply(self._path(str(data_set.meta["ply_file_path"])))
+        elif self._colmap.is_dir():
+            xyz, rgb, transform = *finite(*read_points(self._colmap)), data_set.from_original
         if len(xyz) < MIN_POINTS:
             finding = f"there are {len(xyz)} usable points (of ply_file_path, or in colmap/sparse/0)"
             warn(f"{data_set.source}: {finding}. Training starts from random points, which costs quality.")
@@ -232,7 +271,7 @@ class NrfgsDataParser(DataParser):
         in nerfstudio; and the file that messages name."""
         meta, source = read_transforms(self.config.data)
         checks.check_frames(meta["frames"], source)
-        meta["frames"].sort(key=lambda frame: self._file(frame["file_path"]).parts)
+        meta["frames"].sort(key=lambda frame: self._path(frame["file_path"]).parts)
         return meta, source
 
     @property
@@ -249,26 +288,55 @@ class NrfgsDataParser(DataParser):
         """Folder of one kind of files in full size, beside which smaller copies are."""
         return self._folder / FOLDERS[key]
 
-    def _file(self, name: str, key: str = "file_path") -> Path:
-        """A file of a frame, in full size."""
-        return self._folder / name
-
-    def _copy(self, name: str, key: str, factor: int) -> Path:
-        """Its copy at 1 / factor of the size, which need not be there."""
-        return self._copies(key, factor) / Path(name).name
+    def _path(self, name: str, key: str = "file_path", factor: int = 1) -> Path:
+        """A file of a frame, or its copy at 1 / factor of the size, which need not be there."""
+        return self._folder / name if factor == 1 else self._copies(key, factor) / Path(name).name
 
     def _named_splits(self, meta: dict[str, Any]) -> Named:
         """Splits listed by the data set itself."""
         fields = {split: f"{split}_filenames" for split in SPLITS}
         return {split: (name, meta[name]) for split, name in fields.items() if name in meta}
 
-    def _points(self, data_set: DataSet) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
-        """Positions and colours [N, 3] as stored, and the transform [3, 4] to the cameras' unscaled world."""
-        if "ply_file_path" in data_set.meta:
-            return *read_ply(self._file(str(data_set.meta["ply_file_path"]))), data_set.transform
-        if self._colmap.is_dir():
-            return *read_colmap(self._colmap), after(data_set.transform, data_set.to_frames)
-        return *np.empty((2, 0, 3)), data_set.transform
+
+def place(
+    poses: np.ndarray, orientation: str, centering: str, auto_scale: bool, factor: float
+) -> tuple[Tensor, Tensor, float]:
+    """Orient, centre and scale camera-to-world poses, float64 [V, 4, 4], as nerfstudio does.
+
+    In float32, numbers near ten million are a metre apart. Cameras far from the origin, such as georeferenced ones, are
+    therefore moved there in float64 first, and the way back is float64, too.
+
+    Returns:
+        The poses, float32 [V, 3, 4]; the transform [3, 4] before scaling, float64 if they were far from the origin and
+        otherwise float32; and the scale.
+    """
+    if len(poses) == 1 and orientation == "vertical":  # needs two cameras
+        orientation = "up"
+    positions = poses[:, :3, 3]
+    center = positions.mean(axis=0)
+    extent = np.ptp(positions, axis=0).max()
+    far = centering != "none" and np.abs(center).max() > FAR * extent > 0
+    offset = rounded(center, extent) if far else np.zeros(3)
+    near = poses.copy()
+    near[:, :3, 3] -= offset
+    placed, transform = auto_orient_and_center_poses(
+        torch.from_numpy(near.astype(np.float32)), method=orientation, center_method=centering
+    )
+    if not torch.isfinite(transform).all():
+        raise InputError("The poses' up directions cancel. Give the parser --orientation-method none, or other poses.")
+    reach = float(torch.max(torch.abs(placed[:, :3, 3])))
+    scale = (1.0 / reach if auto_scale and reach > 0 else 1.0) * factor
+    placed[:, :3, 3] *= scale
+    if far:
+        transform = transform.double()
+        transform[:, 3] -= transform[:, :3] @ torch.from_numpy(offset)
+    return placed[:, :3, :4], transform, scale
+
+
+def rounded(place: np.ndarray, extent: float) -> np.ndarray:
+    """A place rounded to units, or to a power of two of the extent if that is less."""
+    step = min(1.0, 2.0 ** np.floor(np.log2(extent)))
+    return np.round(place / step) * step
 
 
 def read_transforms(data: Path) -> tuple[dict[str, Any], Path]:
@@ -277,7 +345,13 @@ def read_transforms(data: Path) -> tuple[dict[str, Any], Path]:
         raise InputError(f"{shown(str(data))}: no such file or folder. Check the path in --data or config.yml.")
     source = data if data.suffix == ".json" else data / "transforms.json"
     if not source.is_file():
-        raise InputError(f"{source} is missing. {_advice_without_transforms(data)}")
+        fix = (
+            "Point --data at a folder that holds one; `nrfgs prepare PHOTOS SCENE` makes one from photographs. Where "
+            "there is a transforms_train.json, put `blender-data` at the end of the command."
+        )
+        if data.is_dir() and (model := find_colmap(data)):
+            fix = f"There is a COLMAP model: put `colmap --colmap-path {model}` at the end of the command."
+        raise InputError(f"{source} is missing. {fix}")
     if source.stat().st_size > LONGEST_JSON:
         raise InputError(f"{source} is larger than {LONGEST_JSON} bytes. Make it anew.")
     try:
@@ -288,15 +362,6 @@ def read_transforms(data: Path) -> tuple[dict[str, Any], Path]:
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise InputError(f"{source}: `frames` must be a non-empty list of objects. Make the file anew.")
     return meta, source
-
-
-def _advice_without_transforms(folder: Path) -> str:
-    if folder.is_dir() and (model := find_colmap(folder)):
-        return f"There is a COLMAP model: put `colmap --colmap-path {model}` at the end of the command."
-    return (
-        "Point --data at a folder that holds one; `nrfgs prepare PHOTOS SCENE` makes one from photographs. Where there "
-        "is a transforms_train.json, put `blender-data` at the end of the command."
-    )
 
 
 nrfgs_dataparser = DataParserSpecification(

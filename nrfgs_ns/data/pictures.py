@@ -108,11 +108,6 @@ def read_mask(path: Path) -> Image.Image:
     return Image.fromarray(inside.astype(np.uint8) * 255)
 
 
-def free_memory() -> float:
-    """Bytes of available memory."""
-    return psutil.virtual_memory().available
-
-
 def in_parallel(
     read: Callable[[int], Result], sizes: Sequence[tuple[int, int]], what: str, workers: int | None = None
 ) -> Iterator[Result]:
@@ -123,7 +118,7 @@ def in_parallel(
 
     width, height = max(sizes, key=math.prod, default=(1, 1))
     each = BYTES_PER_PIXEL * width * height
-    free = free_memory()
+    free = psutil.virtual_memory().available
     if each > free:
         takes = f"takes about {each / 1e9:.1f} GB of memory, and {free / 1e9:.1f} are free"
         fix = "Close other programs, or make the images and masks smaller."

@@ -56,17 +56,6 @@ class Views(NamedTuple):
     """x right, y down, z forward, [V, 4, 4]"""
 
 
-class Visibility(NamedTuple):
-    """How V views see P points."""
-
-    inside: Tensor
-    """bool [V, P]"""
-    depth: Tensor
-    """[V, P]"""
-    in_common: Tensor
-    """points that two views see, weighted by the angle between them, [V, V]; -1 of a view with itself"""
-
-
 def share_kept(views: int) -> float:
     """Share of the points from photographs that a training with this number of views starts with; 0: none."""
     weight = math.exp(-((views / VIEWS) ** 2))
@@ -103,8 +92,9 @@ def small_views(images: Iterable[Tensor], masks: Iterable[Tensor | None], intrin
     return Views(table[:, :3].permute(0, 2, 3, 1), table[:, 3] > 0.99, intrinsics, poses)
 
 
-def visibility(views: Views, points: Tensor) -> Visibility:
-    """Which views see which of the capture's own points [P, 3], occlusion aside."""
+def neighbours(views: Views, points: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+    """For each view the depths of the capture's own points [P, 3] in it, occlusion aside, and the views that it is
+    compared with [at most SOURCES]: those that see the most of the same points from other places."""
     rotation, shift = views.world_to_camera[:, :3, :3], views.world_to_camera[:, :3, 3]
     seen = points @ rotation.mT + shift[:, None]
     depth = seen[..., 2]
@@ -113,19 +103,16 @@ def visibility(views: Views, points: Tensor) -> Visibility:
     inside = (depth > 0) & (places > 0).all(-1) & (places[..., 0] < width) & (places[..., 1] < height)
     centers = -(rotation.mT @ shift[..., None])[..., 0]
     rays = F.normalize(points - centers[:, None], dim=-1)
-    in_common = points.new_full((len(centers), len(centers)), -1.0)
+    compared = []
     for one in range(len(centers)):
         angle = torch.rad2deg(torch.acos((rays[one] * rays).sum(-1).clamp(-1, 1)))
         wider = torch.exp(-(((angle - BEST_ANGLE) / WIDTH) ** 2))
         weight = torch.where(angle < BEST_ANGLE, (angle / BEST_ANGLE) ** 2, wider)
-        in_common[one] = (weight * (inside[one] & inside)).sum(-1)
-    return Visibility(inside, depth, in_common.fill_diagonal_(-1.0))
-
-
-def sources(in_common: Tensor) -> Tensor:
-    """The views that one view is compared with, by its row of `Visibility.in_common`, [at most SOURCES]."""
-    best = in_common.topk(min(SOURCES, len(in_common)))
-    return best.indices[best.values > (0.05 * best.values[0]).clamp_min(LEAST_IN_COMMON)]
+        in_common = (weight * (inside[one] & inside)).sum(-1)
+        in_common[one] = -1.0
+        best = in_common.topk(min(SOURCES, len(in_common)))
+        compared.append(best.indices[best.values > (0.05 * best.values[0]).clamp_min(LEAST_IN_COMMON)])
+    return [row[within] for row, within in zip(depth, inside, strict=True)], compared
 
 
 def inverse_depths(views: Views, one: int, others: Tensor, near: float, far: float) -> Tensor:
@@ -198,14 +185,12 @@ def dense_points(
         Positions [N, 3] and colours in 0..1 [N, 3].
     """
     grey = (views.rgb @ views.rgb.new_tensor([0.299, 0.587, 0.114]))[:, None]
-    known = visibility(views, points[:: max(len(points) // MOST_POINTS, 1)])
-    compared = [sources(row) for row in known.in_common]
+    depths, compared = neighbours(views, points[:: max(len(points) // MOST_POINTS, 1)])
     inverse = grey.new_zeros(len(grey), *grey.shape[2:])
     good = torch.zeros_like(inverse, dtype=torch.bool)
     for one in track(range(len(grey))):
-        depths = known.depth[one][known.inside[one]]
-        if len(compared[one]) >= AGREEING and len(depths) > 0:
-            near, far = (float(depths.quantile(q)) for q in (0.01, 0.99))
+        if len(compared[one]) >= AGREEING and len(depths[one]) > 0:
+            near, far = (float(depths[one].quantile(q)) for q in (0.01, 0.99))
             planes = inverse_depths(views, one, compared[one], 0.8 * near, 1.5 * far)
             inverse[one], correlation = sweep(views, grey, one, compared[one], planes)
             good[one] = correlation > MIN_CORRELATION

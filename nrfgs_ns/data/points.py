@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Initial point clouds, without open3d: .ply files and COLMAP's points3D; and whether the training views see them.
+"""Initial point clouds: .ply files, without open3d; which points are good, and whether the training views see them.
 
-Both readers return positions, float64 [N, 3] in the world of the file, and colours, uint8 [N, 3]. Points that are not
-finite are left out with a warning. A damaged file raises InputError: no training starts from random points unnoticed.
+Positions are float64 [N, 3] in the world of the file, colours uint8 [N, 3]. Points that are not finite are left out
+with a warning. A damaged file raises InputError: no training starts from random points unnoticed.
 """
 
 import os
@@ -14,9 +14,8 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from plyfile import PlyData
 
-from nrfgs_ns.data.cameras import undistorted_cameras
 from nrfgs_ns.data.checks import shown, some, warn
-from nrfgs_ns.data.colmap import read_points
+from nrfgs_ns.data.lenses import undistorted_cameras
 from nrfgs_ns.data.views import in_view
 from nrfgs_ns.errors import InputError
 
@@ -55,7 +54,7 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if not has_colors:
         warn(f"{path} has no colours; its points start in mid grey.")
     rgb = rgb.astype(np.float64) * (255.0 if rgb.dtype.kind == "f" else 1.0)
-    return _finite(stored.astype(np.float64), rgb, path)
+    return finite(stored.astype(np.float64), rgb, path)
 
 
 def _columns(vertices: np.ndarray, names: Sequence[str]) -> np.ndarray:
@@ -66,13 +65,8 @@ def _columns(vertices: np.ndarray, names: Sequence[str]) -> np.ndarray:
     return table
 
 
-def read_colmap(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read points3D.bin or points3D.txt of a COLMAP model."""
-    return _finite(*read_points(folder))
-
-
-def _finite(xyz: np.ndarray, rgb: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Finite points, with colours as uint8."""
+def finite(xyz: np.ndarray, rgb: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The finite points of a file, with colours as uint8."""
     good = np.isfinite(xyz).all(1) & np.isfinite(rgb).all(1)
     finding = f"{path}: {np.count_nonzero(~good)} of {len(good)} points have a NaN or infinite value"
     if np.count_nonzero(good) < len(good) / 2:

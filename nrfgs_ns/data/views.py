@@ -1,16 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Choices of views: evenly spaced, for testing, different ones; a capture's unit of length, and how near it comes."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
-
-if TYPE_CHECKING:  # `nrfgs prepare` does without torch
-    from nerfstudio.cameras.cameras import Cameras
-    from torch import Tensor
+from nerfstudio.cameras.cameras import Cameras
+from scipy.spatial import cKDTree
+from torch import Tensor, cdist
 
 
 def evenly_spaced(total: int, wanted: int) -> list[int]:
@@ -108,8 +104,6 @@ def camera_spacing(centers: Tensor) -> float:
     It is the median, weighted by length, of the distances from each place to the two nearest other places. The short
     distances in pairs and clusters of cameras do not decide it, nor do the long ones of a few cameras far off.
     """
-    from torch import cdist
-
     places = distinct_places(centers.double())
     count = min(NEIGHBOURS, len(places) - 1)
     if count == 0:
@@ -129,8 +123,6 @@ def _in_reaches(centers: Tensor) -> np.ndarray:
 
 def _first_of_each(rows: np.ndarray) -> list[int]:
     """Indices of rows [V, K] not within `SAME_PLACE` of an earlier one, in almost linear time."""
-    from scipy.spatial import cKDTree
-
     kept = []
     near = np.zeros(len(rows), dtype=bool)
     tree = cKDTree(rows)

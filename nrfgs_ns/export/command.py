@@ -10,7 +10,7 @@ import tyro
 
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import check_writable
-from nrfgs_ns.trained.find import NamesTraining
+from nrfgs_ns.trained.command import NamesTraining
 
 SCENE = "scene.nrf"
 """Name of the scene's file in a page's folder."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from nrfgs_ns.appearance.sh import sh_bases
-from nrfgs_ns.data.cameras import rounded
+from nrfgs_ns.data.dataparser import rounded
 from nrfgs_ns.model.harmonics_fit import PlainSplats
 
 

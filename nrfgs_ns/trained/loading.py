@@ -5,26 +5,32 @@ import json
 import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from nrfgs_ns.compact.decode import decode, model_state
+from nrfgs_ns.data.pictures import picture_names
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.files import write_whole
-
-if TYPE_CHECKING:  # nerfstudio takes seconds to import: `nrfgs --help` answers at once
-    from nerfstudio.engine.trainer import TrainerConfig
-
-    from nrfgs_ns.model.model import NrfgsModel
-    from nrfgs_ns.training.pipeline import NrfgsPipeline
+from nrfgs_ns.image.metrics import psnr
+from nrfgs_ns.model.config import NrfgsModelConfig
+from nrfgs_ns.model.model import NrfgsModel
+from nrfgs_ns.progress import progress
+from nrfgs_ns.training.checkpoint_files import find, read_latest
+from nrfgs_ns.training.config_file import read_config
+from nrfgs_ns.training.pipeline import NrfgsPipeline, NrfgsPipelineConfig
 
 
 class Trained(NamedTuple):
     """A finished training."""
 
-    config: "TrainerConfig"
-    pipeline: "NrfgsPipeline"
+    config: TrainerConfig
+    pipeline: NrfgsPipeline
     """in evaluation mode"""
     checkpoint: Path
     step: int
@@ -36,10 +42,6 @@ def load_training(path: Path, mode: Literal["test", "inference"]) -> Trained:
     Mode "test" reads the test images; "inference" reads none, and fits harmonics to the head. InputError if there is no
     such training, or its method is not this project's.
     """
-    from nrfgs_ns.training.checkpoint_files import find, read_latest
-    from nrfgs_ns.training.config_file import read_config
-    from nrfgs_ns.training.pipeline import NrfgsPipelineConfig
-
     config = read_config(path)
     if not isinstance(config.pipeline, NrfgsPipelineConfig):
         raise InputError(f"{path}: a training of {config.method_name}. Use nerfstudio's own commands for it.")
@@ -58,7 +60,7 @@ def load_training(path: Path, mode: Literal["test", "inference"]) -> Trained:
     return Trained(config, pipeline, checkpoint, content["step"])
 
 
-def find_data(config: "TrainerConfig", path: Path) -> None:
+def find_data(config: TrainerConfig, path: Path) -> None:
     """Set the data set's present place: as stored, or, since outputs and data may be moved together, the same relative
     to config.yml; InputError if it is in neither."""
     manager = config.pipeline.datamanager
@@ -66,16 +68,15 @@ def find_data(config: "TrainerConfig", path: Path) -> None:
     if stored is None or stored.exists():
         return
     begin = config.output_dir.absolute()
-    now = path.absolute().parents[3:4]  # outputs/EXPERIMENT/METHOD/TIME/config.yml
-    places = [(folder / os.path.relpath(stored.absolute(), begin)).resolve() for folder in now if folder != begin]
-    place = next((place for place in places if place.exists()), None)
-    if place is None:
-        tried = "".join(f", nor at {place}" for place in places)
+    now = path.absolute().parents[:4][-1]  # outputs/EXPERIMENT/METHOD/TIME/config.yml
+    place = (now / os.path.relpath(stored.absolute(), begin)).resolve()
+    if not place.exists():
+        tried = "" if now == begin else f", nor at {place}"
         raise InputError(f"{path}: its data set is not at {stored}{tried}. Put it there, or change both `data` in it.")
     config.data = manager.data = manager.dataparser.data = place
 
 
-def load_model(path: Path, mode: Literal["test", "inference"], measured: bool = False) -> "NrfgsPipeline":
+def load_model(path: Path, mode: Literal["test", "inference"], measured: bool = False) -> NrfgsPipeline:
     """The pipeline of `load_training`; InputError also without splats, or if masks leave nothing to be measured."""
     pipeline = load_training(path, mode).pipeline
     if pipeline.model.num_points == 0:
@@ -85,13 +86,8 @@ def load_model(path: Path, mode: Literal["test", "inference"], measured: bool = 
     return pipeline
 
 
-def load_file(path: Path) -> "NrfgsModel":
+def load_file(path: Path) -> NrfgsModel:
     """The model in a compact file, in evaluation mode, without config.yml or data set; InputError as `decode`."""
-    from nerfstudio.data.scene_box import SceneBox
-
-    from nrfgs_ns.compact.decode import decode, model_state
-    from nrfgs_ns.model.config import NrfgsModelConfig
-
     decoded = decode(path)
     means = decoded.splats["means"]
     mode, background = (decoded.header["render"][name] for name in ("rasterize_mode", "background"))
@@ -119,10 +115,6 @@ def measure_loss(pipeline, pictures: Callable[[Any], dict[str, Tensor]]) -> dict
         means over the images, dB, inside their masks: psnr_model, psnr_NAME; loss_db: model minus file; per_image; and
         views: "test", or where no image is kept for testing "training".
     """
-    from nrfgs_ns.data.pictures import picture_names
-    from nrfgs_ns.image.metrics import psnr
-    from nrfgs_ns.progress import progress
-
     model, data = pipeline.model, pipeline.datamanager
     names = picture_names(data.eval_dataset.image_filenames)
     per_image = []
@@ -144,8 +136,6 @@ def measure_loss(pipeline, pictures: Callable[[Any], dict[str, Tensor]]) -> dict
 
 def finish(lines: Iterable[str], numbers: dict[str, Any], report: Path | None) -> None:
     """Print an export's result, and write its numbers as JSON into `report`, if given."""
-    from nerfstudio.utils.rich_utils import CONSOLE
-
     for line in lines:
         CONSOLE.print(line, markup=False, soft_wrap=True)
     if report is not None:

@@ -11,8 +11,8 @@ from typing import Any
 import torch
 from nerfstudio.data.datasets.base_dataset import InputDataset
 
-from nrfgs_ns.data.cameras import LENS
 from nrfgs_ns.data.checks import shown, some
+from nrfgs_ns.data.lenses import LENS
 from nrfgs_ns.densification import DensificationConfig
 from nrfgs_ns.errors import InputError
 

@@ -94,12 +94,12 @@ class NrfgsPipeline(VanillaPipeline):
 
     @property
     def cameras_to_fit(self) -> Cameras:
-        """The training cameras in the size of the training, also where nerfstudio gives them the photographs'."""
+        """The training cameras in the size of the training, also where nerfstudio gives them the photographs'; without
+        a downscale factor the fit halves large ones, as the training did (`harmonics_fit.no_larger`)."""
         cameras = deepcopy(self.datamanager.train_dataset.cameras)
         parser = self.datamanager.dataparser
         if self.test_mode == "inference" and hasattr(type(parser), "downscale_factor"):  # which nerfstudio has set to 1
-            factor = getattr(parser, "training_factor", parser.config.downscale_factor)
-            cameras.rescale_output_resolution(1 / (factor or 1))
+            cameras.rescale_output_resolution(1 / (parser.config.downscale_factor or 1))
         return cameras
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:

@@ -7,6 +7,7 @@ cannot reach a training, an evaluation or ns-render.
 
 import sys
 import threading
+from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -17,7 +18,7 @@ from nerfstudio.viewer.viewer_elements import ViewerControl
 from torch import Tensor
 from viser.transforms import SO3
 
-from nrfgs_ns.viewer.pictures import FULL, PictureOptions, legends, picture
+from nrfgs_ns.viewer.pictures import FULL, legends, picture
 from nrfgs_ns.viewer.server import protect
 from nrfgs_ns.viewer.start import open_sooner
 
@@ -79,11 +80,12 @@ class ViewerPanel(ViewerControl):
             client.camera.wxyz = first.wxyz
 
     @property
-    def options(self) -> PictureOptions:
-        """The picture that the controls name."""
+    def options(self) -> dict[str, Any]:
+        """Options of `picture` that the controls name."""
         center = self.frozen_center if self.freeze.value else None
         photograph = None if self.look.value == MEAN_LOOK else self.photographs.index(self.look.value)
-        return PictureOptions(self.mode.value, float(self.gain.value), center, photograph)
+        named = {"mode": self.mode.value, "gain": float(self.gain.value)}
+        return named | {"frozen_center": center, "photograph": photograph}
 
     def render(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
         """Render one camera, a batch of one, as the controls say (`picture`)."""
@@ -91,14 +93,12 @@ class ViewerPanel(ViewerControl):
         background = self.background if self.model.config.background_color == "random" else None
         self.model.set_crop(obb_box)
         trace = sys.gettrace()  # nerfstudio's, which interrupts a rendering by an exception at any line
-        if not self.is_slow:
-            sys.settrace(None)
+        sys.settrace(trace if self.is_slow else None)
         try:
-            return picture(self.model, camera, self.options, background)
+            return picture(self.model, camera, background=background, **self.options)
         finally:
             self.model.set_crop(None)
-            if not self.is_slow:
-                sys.settrace(trace)
+            sys.settrace(trace)
 
     @property
     def is_slow(self) -> bool:

@@ -11,8 +11,6 @@ Modes, besides those that the head itself offers (`AppearanceHead.components`):
 Changes of colour or opacity are drawn around grey, AMPLIFICATION times as large; weights in viridis, dark to bright.
 """
 
-from dataclasses import dataclass
-
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.colormaps import apply_float_colormap
@@ -47,20 +45,6 @@ LEGENDS = {
 """Explanations by mode or kind of component"""
 
 
-@dataclass(frozen=True)
-class PictureOptions:
-    """What `picture` shows."""
-
-    mode: str = FULL
-    """a key of `legends(field)`"""
-    gain: float = 1.0
-    """factor of the residuals, >= 0; 1 is as trained"""
-    frozen_center: Tensor | None = None
-    """point [3] from which splats are seen, in world units; None: the camera's"""
-    photograph: int | None = None
-    """the training photograph whose exposure the image has; None: the mean of all"""
-
-
 def legends(field: Field) -> dict[str, str]:
     """The line under the panel's dropdown, for each mode in which a field can be shown."""
     means = field.splats["means"]
@@ -74,11 +58,23 @@ def legends(field: Field) -> dict[str, str]:
 
 
 @torch.no_grad()
-def picture(model, camera: Cameras, options: PictureOptions, background: Tensor | None = None) -> dict[str, Tensor]:
+def picture(
+    model,
+    camera: Cameras,
+    mode: str = FULL,
+    gain: float = 1.0,
+    frozen_center: Tensor | None = None,
+    photograph: int | None = None,
+    background: Tensor | None = None,
+) -> dict[str, Tensor]:
     """Render one camera, a batch of [1], in one mode.
 
     Args:
         model: an NrfgsModel in evaluation mode.
+        mode: a key of `legends(model.field)`.
+        gain: factor of the residuals, >= 0; 1 is as trained.
+        frozen_center: point [3] from which splats are seen, in world units; None: the camera's.
+        photograph: the training photograph whose exposure the image has; None: the mean of all.
         background: a colour [3] behind the splats instead of the configuration's.
 
     Returns:
@@ -87,23 +83,23 @@ def picture(model, camera: Cameras, options: PictureOptions, background: Tensor 
     """
     field = model.field
     view = model.project(camera, field.splats)
-    if options.frozen_center is not None:
-        view = view._replace(center=options.frozen_center.to(view.center))
-    appearance = with_gain(field, view, 0.0 if options.mode == BASE else options.gain)
-    outputs, _ = model.composite(view, appearance, background, model.look_of(options.photograph))
-    if options.mode in (FULL, BASE):
+    if frozen_center is not None:
+        view = view._replace(center=frozen_center.to(view.center))
+    appearance = with_gain(field, view, 0.0 if mode == BASE else gain)
+    outputs, _ = model.composite(view, appearance, background, model.look_of(photograph))
+    if mode in (FULL, BASE):
         return outputs
 
     accumulation, behind = outputs["accumulation"], outputs["background"]
-    if options.mode == DEPTH:
+    if mode == DEPTH:
         share = scaled_depth(outputs["depth"], accumulation)
-    elif options.mode == VIEW_DEPENDENCE:
+    elif mode == VIEW_DEPENDENCE:
         share = _blend(view, view_dependence(field, view) / FULL_DEVIATION, appearance.opacities, accumulation)
     else:
-        component = field.head.components(field.splats, view.visible, view.center)[options.mode]
+        component = field.head.components(field.splats, view.visible, view.center)[mode]
         if component.kind != "weight":
             axis = 1.0 if component.kind == "color" else component.values.new_tensor(OPACITY_AXIS)
-            drawn = GREY + AMPLIFICATION * options.gain * component.values * axis
+            drawn = GREY + AMPLIFICATION * gain * component.values * axis
             render, _, _ = composite(view.projection, drawn, appearance.opacities)
             outputs["rgb"] = (render[0] + (1 - accumulation) * GREY).clamp(0.0, 1.0)
             return outputs

@@ -23,7 +23,7 @@ from nrfgs_ns.appearance.reduce import build
 from nrfgs_ns.compact.decode import decode
 from nrfgs_ns.compact.encode import LARGEST_LOGIT, encode
 from nrfgs_ns.compact.entropy import encode_table
-from nrfgs_ns.compact.finetune import CodedSplats, Density, Gated, Rounded, bits_of_places, fine_tune, growth_without
+from nrfgs_ns.compact.finetune import CodedSplats, Density, Rounded, bits_of_places, fine_tune, growth_without
 from nrfgs_ns.compact.tables import NEAR, OCTAHEDRAL, STEPS, Grid, from_morton, morton, nearest_turn
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Export
@@ -240,7 +240,9 @@ def test_what_a_splat_is_worth_is_what_pictures_lose_without_it(exported):
 
     @torch.no_grad()
     def error(gates):
-        outputs = model.render(one, camera, Gated(one, gates))
+        view = model.project(camera, one.splats)
+        seen = one.seen_from(view)
+        outputs, _ = model.composite(view, seen._replace(opacities=seen.opacities * gates[view.visible]))
         return float((outputs["rgb"] - model.truth_of(batch, outputs["background"])).square().sum())
 
     ones = torch.ones(len(growth))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from nrfgs_ns.data.cameras import check_poses
+from nrfgs_ns.data.checks import check_poses
 from nrfgs_ns.errors import InputError
 
 LAST = "images/000.png"  # the frames are listed backwards

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import os
 import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -95,7 +96,7 @@ def test_free_memory_and_small_pictures_bound_the_threads_that_decode(monkeypatc
         running.remove(index)
 
     monkeypatch.setattr("os.cpu_count", lambda: 64)
-    monkeypatch.setattr("nrfgs_ns.data.pictures.free_memory", lambda: free)
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=free))
     barrier = threading.Barrier(threads)
     list(in_parallel(read, [(12, 9)] * 12, "Reading", workers))
     assert max(most) == threads

@@ -13,6 +13,7 @@ import short_trainings
 import torch
 import tyro
 from compact_fields import plain_splats
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import MAX_AUTO_RESOLUTION
 from plyfile import PlyData
 from short_trainings import command_line, untrained
 from torch.testing import assert_close
@@ -278,11 +279,11 @@ def test_an_antialiased_model_is_marked_as_such(trained, tmp_path, monkeypatch):
 
 
 def test_harmonics_are_fitted_in_the_size_of_the_training(tiny_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("nrfgs_ns.data.dataparser.MAX_AUTO_RESOLUTION", 30)
-    monkeypatch.setattr("nrfgs_ns.data.dataparser.NrfgsDataParser._resizes", True)
-    for chosen in ((), ("--downscale-factor", 2)):
-        half = untrained(tiny_scene, tmp_path, "nrfgs", "nrfgs-data", *chosen, mode="inference")
-        assert int(half.cameras_to_fit.width[0]) == 24 and int(half.datamanager.train_dataset.cameras.width[0]) == 48
+    half = untrained(tiny_scene, tmp_path, "nrfgs", "nrfgs-data", "--downscale-factor", 2, mode="inference")
+    assert int(half.cameras_to_fit.width[0]) == 24 and int(half.datamanager.train_dataset.cameras.width[0]) == 48
+    assert harmonics_fit.LONGEST_SIDE == MAX_AUTO_RESOLUTION, "by itself a training halves as a fit does"
+    monkeypatch.setattr(harmonics_fit, "LONGEST_SIDE", 30)
+    assert int(harmonics_fit.no_larger(half.datamanager.train_dataset.cameras[:1]).width) == 24
 
 
 @pytest.mark.parametrize("method", METHODS)

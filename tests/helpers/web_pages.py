@@ -22,7 +22,7 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.compact.encode import encode
 from nrfgs_ns.export.web.page import page as page_of
 from nrfgs_ns.trained.loading import load_file
-from nrfgs_ns.viewer.pictures import BASE, FULL, GREY, PictureOptions, legends, picture
+from nrfgs_ns.viewer.pictures import BASE, FULL, GREY, legends, picture
 
 SIZE = (320, 240)
 
@@ -169,7 +169,7 @@ def rendered(scene: Path, photograph: dict, mode: str = FULL, gain: float = 1.0)
     if mode not in legends(model.field):
         return torch.full((height, width, 3), GREY)
     camera = Cameras(torch.tensor(photograph["pose"]).view(1, 3, 4), *photograph["lens"], width, height)
-    return picture(model, camera, PictureOptions(mode, gain=gain))["rgb"]
+    return picture(model, camera, mode, gain=gain)["rgb"]
 
 
 @contextlib.contextmanager

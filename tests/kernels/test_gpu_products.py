@@ -12,7 +12,7 @@ from short_trainings import command_line, trained, untrained
 from nrfgs_lab.training_run import evaluate
 from nrfgs_ns.export.command import Compact, Ply
 from nrfgs_ns.export.ply import read_splats
-from nrfgs_ns.viewer.pictures import AMPLIFICATION, BASE, DEPTH, FULL, VIEW_DEPENDENCE, PictureOptions, legends, picture
+from nrfgs_ns.viewer.pictures import AMPLIFICATION, BASE, DEPTH, FULL, VIEW_DEPENDENCE, legends, picture
 
 pytestmark = pytest.mark.gpu
 FROZEN = "full, as seen from another camera"
@@ -36,11 +36,11 @@ def viewer_pictures(device: str, scene: Path, out: Path) -> dict[str, torch.Tens
     model.update_to_step(10**6)
     pipeline.eval()
     camera, elsewhere = cameras[0:1], cameras[4:5].camera_to_worlds[0, :3, 3]
-    shown = {mode: PictureOptions(mode) for mode in legends(model.field)}
-    shown[FROZEN] = PictureOptions(frozen_center=elsewhere)
+    shown = {mode: {"mode": mode} for mode in legends(model.field)}
+    shown[FROZEN] = {"frozen_center": elsewhere}
     pictures = {}
     for name, what in shown.items():
-        pictures[name] = picture(model, camera, what)["rgb"]
+        pictures[name] = picture(model, camera, **what)["rgb"]
         assert pictures[name].shape == (36, 48, 3) and pictures[name].device.type == device, name
         assert ((pictures[name] >= 0) & (pictures[name] <= 1)).all(), name  # NaN is in no interval
     assert torch.equal(pictures[FULL], model.get_outputs_for_camera(camera)["rgb"])

@@ -15,7 +15,7 @@ from nrfgs_ns.appearance.head import Field
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Compact, Ply, Web
 from nrfgs_ns.rasterizer import Pinhole, ProjectionOptions, composite_view, project_view, world_to_camera
-from nrfgs_ns.viewer.pictures import BASE, DEPTH, FULL, PictureOptions, legends, picture
+from nrfgs_ns.viewer.pictures import BASE, DEPTH, FULL, legends, picture
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -87,8 +87,8 @@ def test_every_picture_of_the_viewer(finished):
     pipeline = eval_setup(config)[1]
     model, camera = pipeline.model, pipeline.datamanager.train_dataset.cameras[0:1]
     assert list(legends(model.field)) == [FULL, BASE, DEPTH]
-    images = {mode: picture(model, camera, PictureOptions(mode))["rgb"] for mode in legends(model.field)}
-    gains = [picture(model, camera, PictureOptions(gain=gain))["rgb"] for gain in (0.0, 0.5, 2.0)]
+    images = {mode: picture(model, camera, mode)["rgb"] for mode in legends(model.field)}
+    gains = [picture(model, camera, gain=gain)["rgb"] for gain in (0.0, 0.5, 2.0)]
     assert all(image.shape == (36, 48, 3) and torch.isfinite(image).all() for image in (*images.values(), *gains))
     assert torch.equal(images[FULL], model.get_outputs_for_camera(camera)["rgb"])
     assert torch.equal(images[BASE], gains[0]) and torch.equal(images[BASE], model.get_base_color(camera))

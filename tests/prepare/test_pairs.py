@@ -31,12 +31,12 @@ def test_shared_features_are_counted(count):
 
 def test_alike_near_and_following_photographs_are_paired():
     count = 40
-    nothing = np.zeros((count, count), dtype=int)
-    assert pairs.likely_pairs(nothing, None, in_a_row=False) == []
+    nothing, nowhere = np.zeros((count, count), dtype=int), np.full((count, 3), np.nan)
+    assert pairs.likely_pairs(nothing, nowhere, in_a_row=False) == []
 
     alike = nothing.copy()
     alike[3, 30] = alike[30, 3] = 7
-    assert pairs.likely_pairs(alike, None, in_a_row=False) == [(3, 30)]
+    assert pairs.likely_pairs(alike, nowhere, in_a_row=False) == [(3, 30)]
 
     places = np.stack([100.0 * (np.arange(count) % 20), np.zeros(count)], axis=1)  # 20 places, each visited twice
     places[5] = np.nan
@@ -44,9 +44,9 @@ def test_alike_near_and_following_photographs_are_paired():
     assert {(0, 20), (7, 27), (19, 39)} <= set(near) and (0, 19) not in near
     assert not any(5 in pair for pair in near), "where that one was taken is not known"
 
-    following = pairs.likely_pairs(nothing, None, in_a_row=True)
+    following = pairs.likely_pairs(nothing, nowhere, in_a_row=True)
     assert following == [(i, j) for i in range(count) for j in range(i + 1, min(i + 6, count))]
-    every = pairs.likely_pairs(np.ones((8, 8), int), None, in_a_row=True)
+    every = pairs.likely_pairs(np.ones((8, 8), int), nowhere[:8], in_a_row=True)
     assert every == list(itertools.combinations(range(8), 2)), "of few photographs, every pair"
 
 
@@ -83,4 +83,3 @@ def test_positions_are_laid_out_in_metres(tmp_path):
     # A degree is 111.2 km, and half of it to the east at 60 degrees north.
     assert np.linalg.norm(laid[0] - laid[2]) == pytest.approx(111.2, abs=0.1)
     assert np.linalg.norm(laid[0] - laid[3]) == pytest.approx(111.2, abs=0.1)
-    assert pairs.metres(np.array([unknown, (60.0, 10.0)])) is None

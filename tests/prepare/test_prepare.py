@@ -180,7 +180,7 @@ def test_finished_work_is_not_repeated_and_changes_are_noticed(prepared, walls, 
         run_quietly(source, out)
     stored = [path.read_bytes() for path in sorted((out / "work" / "photos").iterdir())]
     assert stored[2] == stored[3], "the changed photograph was taken in"
-    assert json.loads((out / "work" / "state.json").read_text())["features"]["done"] is False
+    assert json.loads((out / "prepare.json").read_text())["features"]["done"] is False
 
 
 def test_interrupted_features_are_taken_up(walls, tmp_path, monkeypatch):
@@ -303,17 +303,17 @@ def test_what_is_refused_before_any_work(three, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("file", "content", "said"), [
-    ("state.json", "[1, 2]", "state.json is damaged"),
-    ("state.json", "{", "state.json is damaged"),
-    ("features/database.db", "no database", "COLMAP stops with"),
+    ("prepare.json", "[1, 2]", "prepare.json is damaged"),
+    ("prepare.json", "{", "prepare.json is damaged"),
+    ("work/features/database.db", "no database", "COLMAP stops with"),
 ])  # fmt: skip
 def test_damaged_work_is_told_in_one_sentence(prepared, walls, tmp_path, file, content, said):
     out = shutil.copytree(prepared, tmp_path / "scene")
     shutil.rmtree(out / "work" / "model")
-    (out / "work" / file).write_text(content)
+    (out / file).write_text(content)
     with pytest.raises(InputError, match=said):
         Prepare(walls, out).main()
-    shutil.rmtree(out / "work")
+    shutil.rmtree(out / "work" if file.startswith("work") else out)
     Run(Prepare(walls, out))  # as the message says
 
 

@@ -31,7 +31,7 @@ from nrfgs_ns.image.photograph import BASIS
 from nrfgs_ns.rasterizer import View
 from nrfgs_ns.viewer import pictures as drawn
 from nrfgs_ns.viewer import start
-from nrfgs_ns.viewer.pictures import BASE, DEPTH, FULL, VIEW_DEPENDENCE, PictureOptions, legends, picture
+from nrfgs_ns.viewer.pictures import BASE, DEPTH, FULL, VIEW_DEPENDENCE, legends, picture
 
 pytestmark = pytest.mark.usefixtures("no_cuda")
 
@@ -90,7 +90,7 @@ def test_every_mode_is_a_picture_of_its_own(build, method):
     model, (camera, _) = pipeline.model, two_cameras(pipeline)
     pictures = {}
     for mode in legends(model.field):
-        outputs = picture(model, camera, PictureOptions(mode))
+        outputs = picture(model, camera, mode)
         assert outputs.keys() == model.get_outputs(camera).keys()
         rgb = outputs["rgb"]
         assert rgb.shape == (36, 48, 3) and torch.isfinite(rgb).all() and 0 <= rgb.min() and rgb.max() <= 1
@@ -102,15 +102,15 @@ def test_every_mode_is_a_picture_of_its_own(build, method):
 
 def test_gain_leads_from_the_base_to_the_trained_image_and_beyond(scene):
     model, camera, _ = scene
-    assert torch.equal(picture(model, camera, PictureOptions(gain=0.0))["rgb"], model.get_base_color(camera))
-    assert torch.equal(picture(model, camera, PictureOptions(BASE, gain=2.0))["rgb"], model.get_base_color(camera))
-    assert torch.equal(picture(model, camera, PictureOptions(gain=1.0))["rgb"], model.get_outputs(camera)["rgb"])
+    assert torch.equal(picture(model, camera, gain=0.0)["rgb"], model.get_base_color(camera))
+    assert torch.equal(picture(model, camera, BASE, gain=2.0)["rgb"], model.get_base_color(camera))
+    assert torch.equal(picture(model, camera, gain=1.0)["rgb"], model.get_outputs(camera)["rgb"])
     view = model.project(camera)
     base, trained = model.field.base_of(view), model.field.seen_from(view)
     colors, opacities = 2 * trained.colors - base.colors, 2 * trained.opacities - base.opacities
     by_hand = model.composite(view, SplatAppearance(colors.clamp_min(0), opacities.clamp(0, 1)))[0]["rgb"]
     # The same to rounding: 2^-24 in each of at most 300 splats that a pixel adds up.
-    assert_close(picture(model, camera, PictureOptions(gain=2.0))["rgb"], by_hand, rtol=0, atol=300 * 2**-24)
+    assert_close(picture(model, camera, gain=2.0)["rgb"], by_hand, rtol=0, atol=300 * 2**-24)
 
 
 @pytest.mark.parametrize("mode", ["residual", "low branch", "high branch", "opacity residual"])
@@ -118,9 +118,9 @@ def test_gain_scales_what_it_shows(scene, mode):
     """Without any gain a change is grey, where the splats are as where they are not."""
     model, camera, _ = scene
     # alpha + (1 - alpha), summed over at most 300 splats
-    grey = picture(model, camera, PictureOptions(mode, gain=0.0))["rgb"]
+    grey = picture(model, camera, mode, gain=0.0)["rgb"]
     assert_close(grey, torch.full_like(grey, 0.5), rtol=0, atol=300 * 2**-24)
-    half, whole = (picture(model, camera, PictureOptions(mode, gain=gain))["rgb"] - 0.5 for gain in (0.5, 1.0))
+    half, whole = (picture(model, camera, mode, gain=gain)["rgb"] - 0.5 for gain in (0.5, 1.0))
     assert half.abs().mean() < whole.abs().mean()
 
 
@@ -128,12 +128,12 @@ def test_frozen_view_is_the_head_seen_from_elsewhere(scene):
     model, here, there = scene
     center = model.project(there).center
     view = model.project(here)
-    frozen = picture(model, here, PictureOptions(frozen_center=center))["rgb"]
+    frozen = picture(model, here, frozen_center=center)["rgb"]
     assert torch.equal(frozen, model.composite(view, model.field.seen_from(view._replace(center=center)))[0]["rgb"])
-    unfrozen = picture(model, here, PictureOptions())["rgb"]
+    unfrozen = picture(model, here)["rgb"]
     assert (frozen - unfrozen).abs().mean() > 1 / 255
-    assert torch.equal(picture(model, here, PictureOptions(frozen_center=view.center))["rgb"], unfrozen)
-    residuals = [picture(model, here, PictureOptions("residual", frozen_center=o))["rgb"] for o in (None, center)]
+    assert torch.equal(picture(model, here, frozen_center=view.center)["rgb"], unfrozen)
+    residuals = [picture(model, here, "residual", frozen_center=o)["rgb"] for o in (None, center)]
     assert (residuals[0] - residuals[1]).abs().mean() > 1 / 255
 
 
@@ -239,7 +239,7 @@ def test_the_panel_rules_the_browser_and_nothing_else(build, open_viewer):
     panel.frozen_center, panel.freeze.value = model.project(elsewhere).center, True
     viewer.control_panel.background_color = (255, 0, 0)
     viewer.control_panel.crop_viewport = True
-    assert panel.options.mode == "residual" and panel.options.gain == 1.5
+    assert panel.options["mode"] == "residual" and panel.options["gain"] == 1.5
     assert (coarse(Browser.sees(viewer, pose)["rgb"]) - plain).abs().mean() > 0.05
     assert model.crop_box is None
     # The viewer's crop box is one unit wide, and the scene is larger: there is less to see.
@@ -275,16 +275,16 @@ def test_a_photographs_look(build, open_viewer):
     model, (camera, _) = pipeline.model, two_cameras(pipeline)
     with torch.no_grad():
         model.photograph.shots[3] = torch.tensor([-1.0, 0.5, 0.0])
-    plain = picture(model, camera, PictureOptions())["rgb"]
+    plain = picture(model, camera)["rgb"]
     assert torch.equal(plain, model.get_outputs_for_camera(camera)["rgb"])  # the mean look
-    third = picture(model, camera, PictureOptions(photograph=3))["rgb"]
+    third = picture(model, camera, photograph=3)["rgb"]
     assert_close(third, exposed(plain, model.photograph.shots[3] @ torch.tensor(BASIS)))
     assert third.mean() < plain.mean() - 0.02
 
     viewer, panel, pose = open_viewer(pipeline), model.viewer_panel, camera.camera_to_worlds[0]
     seen = coarse(Browser.sees(viewer, pose)["rgb"])
     panel.look.value = model.photograph.names[3]
-    assert panel.options.photograph == 3
+    assert panel.options["photograph"] == 3
     assert coarse(Browser.sees(viewer, pose)["rgb"]).mean() < seen.mean() - 0.01
     assert torch.equal(model.get_outputs_for_camera(camera)["rgb"], plain)
 
