@@ -65,16 +65,6 @@ def twin_tests(kind: str) -> str:
     return "; ".join(cells)
 
 
-def cleared() -> str:
-    """Changes on held-out views if splats before views between the cameras are removed."""
-    cells = []
-    for scene in ("kitchen", "castle"):
-        pairs = [pair for pair in twins("alone__0.7_cleared", "alone") if pair[0]["cell"]["scene"].endswith(scene)]
-        psnr = [one["measured"]["test"]["psnr"] - other["measured"]["test"]["psnr"] for one, other in pairs]
-        cells.append(f"`{scene}` {signed(fmean(psnr), 2)} dB")
-    return ", ".join(cells)
-
-
 def twin_cost(of: str) -> str:
     """What a twin multiplies a training's seconds or peak memory by, in the median of pairs of one sitting each."""
     pairs = [*twins("twin", "alone"), *twins("harmonics", "harmonics_alone")]
@@ -205,7 +195,6 @@ BLOCKS = {
     "captures.twin_tests": twin_tests,
     "captures.twin_cost": twin_cost,
     "captures.floaters": floaters,
-    "captures.cleared": cleared,
     "captures.today": lambda *place: _run({of: mean(today(*place), of) for of in ("psnr", "ssim", "splats")}),
     "captures.sparse": sparse,
     "captures.by_views": lambda: verdicts({f"{views} views": sparse_runs(scene) for scene, views in HALF.items()}),
