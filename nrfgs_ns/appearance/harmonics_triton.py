@@ -14,8 +14,6 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nrfgs_ns.kernels.tables import load_rows, store_rows
-
 BLOCK = 128
 """Splats that a program takes; a power of two."""
 WARPS = 4
@@ -34,7 +32,9 @@ C3ZZZ = tl.constexpr(math.sqrt(7 / (16 * math.pi)))
 @triton.jit
 def _direction(directions, at, valid):
     """Unit directions, and 1 / length."""
-    x, y, z = load_rows(directions, at, valid, 3)
+    x = tl.load(directions + at * 3, mask=valid, other=1.0)
+    y = tl.load(directions + at * 3 + 1, mask=valid, other=0.0)
+    z = tl.load(directions + at * 3 + 2, mask=valid, other=0.0)
     inverse = 1.0 / tl.maximum(tl.sqrt(x * x + y * y + z * z), SMALLEST)
     return x * inverse, y * inverse, z * inverse, inverse
 
@@ -90,9 +90,13 @@ def forward_kernel(
     red, green, blue = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
     for index in tl.static_range(USED):
         value, _, _, _ = _harmonic(index, x, y, z)
-        own = load_rows(coefficients, at * BASES + index, valid, 3)
-        red, green, blue = red + value * own[0], green + value * own[1], blue + value * own[2]
-    store_rows(colors, at, (red, green, blue), valid, 3)
+        own = coefficients + at * (3 * BASES) + 3 * index
+        red += value * tl.load(own, mask=valid, other=0.0)
+        green += value * tl.load(own + 1, mask=valid, other=0.0)
+        blue += value * tl.load(own + 2, mask=valid, other=0.0)
+    tl.store(colors + at * 3, red, mask=valid)
+    tl.store(colors + at * 3 + 1, green, mask=valid)
+    tl.store(colors + at * 3 + 2, blue, mask=valid)
 
 
 @triton.jit(do_not_specialize=["count"])
@@ -104,21 +108,28 @@ def backward_kernel(
     at = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     valid = at < count
     x, y, z, inverse = _direction(directions, at, valid)
-    red, green, blue = load_rows(d_colors, at, valid, 3)
+    red = tl.load(d_colors + at * 3, mask=valid, other=0.0)
+    green = tl.load(d_colors + at * 3 + 1, mask=valid, other=0.0)
+    blue = tl.load(d_colors + at * 3 + 2, mask=valid, other=0.0)
     d_x, d_y, d_z = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
     for index in tl.static_range(BASES):
+        own, d_own = coefficients + at * (3 * BASES) + 3 * index, d_coefficients + at * (3 * BASES) + 3 * index
         value = tl.zeros((BLOCK,), tl.float32)
         if index < USED:
             value, slope_x, slope_y, slope_z = _harmonic(index, x, y, z)
-            own = load_rows(coefficients, at * BASES + index, valid, 3)
-            d_value = red * own[0] + green * own[1] + blue * own[2]
+            d_value = red * tl.load(own, mask=valid, other=0.0)
+            d_value += green * tl.load(own + 1, mask=valid, other=0.0)
+            d_value += blue * tl.load(own + 2, mask=valid, other=0.0)
             d_x += d_value * slope_x
             d_y += d_value * slope_y
             d_z += d_value * slope_z
-        store_rows(d_coefficients, at * BASES + index, (value * red, value * green, value * blue), valid, 3)
+        tl.store(d_own, value * red, mask=valid)
+        tl.store(d_own + 1, value * green, mask=valid)
+        tl.store(d_own + 2, value * blue, mask=valid)
     along = x * d_x + y * d_y + z * d_z
-    across = (d_x - along * x) * inverse, (d_y - along * y) * inverse, (d_z - along * z) * inverse
-    store_rows(d_directions, at, across, valid, 3)
+    tl.store(d_directions + at * 3, (d_x - along * x) * inverse, mask=valid)
+    tl.store(d_directions + at * 3 + 1, (d_y - along * y) * inverse, mask=valid)
+    tl.store(d_directions + at * 3 + 2, (d_z - along * z) * inverse, mask=valid)
 
 
 class Harmonics(torch.autograd.Function):

@@ -77,8 +77,8 @@ class NrfConfig(AppearanceHeadConfig):
     opacity_bound: OpacityBound | None = None
     """how base + residual stays in [0, 1] (docs/deviations.md). straight-through: by a clamp that the gradient ignores.
     logit: added to the logit. None: logit with error-guided and mcmc, otherwise straight-through"""
-    implementation: Literal["auto", "torch"] = "auto"
-    """auto: fused Triton kernels on CUDA where they can run, PyTorch elsewhere"""
+    implementation: Literal["auto", "torch", "fused"] = "auto"
+    """auto: fused Triton kernels on CUDA where they can run, PyTorch elsewhere. fused: the same, in older files"""
     precision: Literal["fp32", "tf32", "bf16", "fp16"] = "bf16"
     """rounding in matrix products of the fused kernels; sums are float32"""
 
@@ -104,10 +104,8 @@ class NrfConfig(AppearanceHeadConfig):
             self.require(getattr(self, name) >= 0, name, "zero or positive")
         self.require(self.distance_eps > 0, "distance_eps", "positive")
         hints = get_type_hints(NrfConfig)
-        choices_of = {name: get_args(hints[name]) for name in ("output_init", "implementation", "precision")}
-        choices_of["implementation"] += ("fused",)  # in what 0.2.0 has saved: the same as auto
-        choices_of["opacity_bound"] = None, *OPACITY_BOUNDS
-        for name, choices in choices_of.items():
+        literals = {name: get_args(hints[name]) for name in ("output_init", "implementation", "precision")}
+        for name, choices in {**literals, "opacity_bound": (None, *OPACITY_BOUNDS)}.items():
             self.require(getattr(self, name) in choices, name, "one of " + ", ".join(map(repr, choices)))
 
 

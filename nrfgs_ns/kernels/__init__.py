@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a Triton kernel is tried and given up, and reads its tables, once for all kernels."""
+"""How a Triton kernel is tried and given up, once for all kernels."""

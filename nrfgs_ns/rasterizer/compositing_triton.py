@@ -31,8 +31,6 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nrfgs_ns.kernels.tables import load_rows
-
 BLOCK = tl.constexpr(8)
 """Side of a tile in pixels."""
 LANES = tl.constexpr(8)
@@ -45,6 +43,15 @@ LN_2 = tl.constexpr(0.6931471805599453)
 MAX_ALPHA = tl.constexpr(0.999)
 MIN_ALPHA = tl.constexpr(1.0 / 255.0)
 MIN_TRANSMITTANCE = tl.constexpr(1e-4)
+
+
+@triton.jit
+def load_rows(table, rows, valid, SIZE: tl.constexpr):
+    """Some rows of a table [.., SIZE], as a tuple of columns; 0 where they are not valid."""
+    columns = ()
+    for i in tl.static_range(SIZE):
+        columns = columns + (tl.load(table + rows * SIZE + i, mask=valid, other=0.0),)
+    return columns
 
 
 @triton.jit

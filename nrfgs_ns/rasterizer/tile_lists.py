@@ -28,8 +28,6 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from nrfgs_ns.kernels.tables import load_rows
-
 from . import TILE_SIZE
 
 SPLATS = 64
@@ -52,8 +50,11 @@ MARGIN = tl.constexpr(1e-3)
 @triton.jit
 def _ellipse(means2d, conics, opacities, rows, valid):
     """Centre, conic, bound of 2 sigma and determinant of the splats in `rows`."""
-    x, y = load_rows(means2d, rows, valid, 2)
-    a, b, c = load_rows(conics, rows, valid, 3)
+    x = tl.load(means2d + rows * 2, mask=valid, other=0.0)
+    y = tl.load(means2d + rows * 2 + 1, mask=valid, other=0.0)
+    a = tl.load(conics + rows * 3, mask=valid, other=1.0)
+    b = tl.load(conics + rows * 3 + 1, mask=valid, other=0.0)
+    c = tl.load(conics + rows * 3 + 2, mask=valid, other=1.0)
     opacity = tl.load(opacities + rows, mask=valid, other=0.0)
     bound = 2.0 * (tl.log(255.0 * opacity) + SLACK)
     # The determinant of a long splat is a small difference of large products.

@@ -94,8 +94,8 @@ class NrfgsPipeline(VanillaPipeline):
 
     @property
     def cameras_to_fit(self) -> Cameras:
-        """The training cameras in the size of the training, also where nerfstudio gives them the photographs'; without
-        a downscale factor the fit halves large ones, as the training did (`harmonics_fit.no_larger`)."""
+        """The training cameras in the size that a downscale factor gives the training, also where nerfstudio gives them
+        the photographs'. The fit halves what is still large (`harmonics_fit.no_larger`)."""
         cameras = deepcopy(self.datamanager.train_dataset.cameras)
         parser = self.datamanager.dataparser
         if self.test_mode == "inference" and hasattr(type(parser), "downscale_factor"):  # which nerfstudio has set to 1

@@ -283,7 +283,8 @@ def test_harmonics_are_fitted_in_the_size_of_the_training(tiny_scene, tmp_path, 
     assert int(half.cameras_to_fit.width[0]) == 24 and int(half.datamanager.train_dataset.cameras.width[0]) == 48
     assert harmonics_fit.LONGEST_SIDE == MAX_AUTO_RESOLUTION, "by itself a training halves as a fit does"
     monkeypatch.setattr(harmonics_fit, "LONGEST_SIDE", 30)
-    assert int(harmonics_fit.no_larger(half.datamanager.train_dataset.cameras[:1]).width) == 24
+    by_itself = untrained(tiny_scene, tmp_path, "nrfgs", "nrfgs-data", mode="inference")
+    assert int(harmonics_fit.no_larger(by_itself.cameras_to_fit[:1]).width) == 24
 
 
 @pytest.mark.parametrize("method", METHODS)

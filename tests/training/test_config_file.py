@@ -128,6 +128,11 @@ def test_a_group_of_options_that_is_gone_is_read(read):
     assert read(WHOLE.replace("  model: ", f"{group}  model: ", 1)) == method_config.nrfgs.config
 
 
+def test_the_choice_of_fused_kernels_is_read(read):
+    text, count = re.subn("implementation: auto", "implementation: fused", WHOLE)
+    assert count == 1 and read(text).pipeline.model.appearance.implementation == "fused"
+
+
 def test_a_file_that_is_not_there_or_no_configuration(tmp_path):
     for cut in (WHOLE[:1], WHOLE[:1000], WHOLE[:-2], WHOLE[: WHOLE.index("viewer:")]):
         (tmp_path / "cut").write_text(cut)
