@@ -162,7 +162,7 @@ def test_lists_are_complete_ordered_and_tight(name):
         begins = torch.cat([counts[camera].cumsum(0) - counts[camera], torch.full((prints.tiles_x,), len(mine))])
         lists_of_camera = begins.view(1, -1, prints.tiles_x).int(), mine - own.int().argmax()
         of_camera = Splats(*(table[own] for table in of))
-        spare += assert_lists(*lists_of_camera, of_camera, prints.tiles_x, prints.tiles_y, SUB_TILE, TILE_SIZE)
+        spare += assert_lists(*lists_of_camera, of_camera, prints.tiles_x, prints.tiles_y, SUB_TILE)
     assert lists.n_pairs <= 1.5 * (lists.n_pairs - spare) + 20
 
 
