@@ -68,10 +68,11 @@ def find_data(config: TrainerConfig, path: Path) -> None:
     if stored is None or stored.exists():
         return
     begin = config.output_dir.absolute()
-    now = path.absolute().parents[:4][-1]  # outputs/EXPERIMENT/METHOD/TIME/config.yml
-    place = (now / os.path.relpath(stored.absolute(), begin)).resolve()
-    if not place.exists():
-        tried = "" if now == begin else f", nor at {place}"
+    now = path.absolute().parents[3:4]  # outputs/EXPERIMENT/METHOD/TIME/config.yml
+    places = [(folder / os.path.relpath(stored.absolute(), begin)).resolve() for folder in now if folder != begin]
+    place = next((place for place in places if place.exists()), None)
+    if place is None:
+        tried = "".join(f", nor at {place}" for place in places)
         raise InputError(f"{path}: its data set is not at {stored}{tried}. Put it there, or change both `data` in it.")
     config.data = manager.data = manager.dataparser.data = place
 
