@@ -24,8 +24,6 @@ from torch.nn.functional import normalize, pad
 
 from nrfgs_ns.appearance.head import SplatAppearance
 
-RasterizeMode = Literal["classic", "antialiased"]
-
 EPS2D = 0.3
 """Blur added to the 2D covariances, in square pixels."""
 TILE_SIZE = 16
@@ -36,7 +34,7 @@ TILE_SIZE = 16
 class ProjectionOptions:
     """Options of a projection. Its planes are splatfacto's where a scene unit is a world unit."""
 
-    rasterize_mode: RasterizeMode = "classic"
+    rasterize_mode: Literal["classic", "antialiased"] = "classic"
     """classic: the blur makes splats wider. antialiased: it also makes them fainter, so that their light is kept"""
     near_plane: float = 0.01
     """smallest visible depth, in world units"""
