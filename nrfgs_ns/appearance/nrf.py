@@ -146,7 +146,8 @@ class NeuralResidualField(AppearanceHead):
         self.fused = FusedField(config, branches)
 
     def try_kernels(self, device: torch.device) -> None:
-        self.fused.try_kernels(device)
+        if self.config.implementation != "torch":
+            self.fused.prepared_on(device)
 
     def splat_params(self, rgb: Tensor) -> dict[str, Tensor]:
         """Base colours and latents: "features_dc" [N, 3], "latents" [N, D] ~ N(0, LATENT_STD^2)."""

@@ -207,8 +207,7 @@ def estimate(pairs: Pairs, known: Tensor, centers: Tensor) -> Looks:
     count = len(known)
     expected = torch.zeros(count, 3, dtype=torch.float64)
     there = torch.isfinite(known)
-    if there.any():
-        expected[there, 0] = slope(pairs, known) * (known[there] - known[there].mean()).double()
+    expected[there, 0] = slope(pairs, known) * (known[there] - known[there].mean()).double()
     usual = USUAL_STOPS
     random = [0.0, 0.0, 0.0]
     places = None

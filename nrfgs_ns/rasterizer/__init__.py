@@ -196,15 +196,9 @@ def composite_view(
         "rgb" [H, W, 3] in [0, 1], "accumulation" [H, W, 1], "background" [H, W, 3], and "depth" [H, W, 1] if wanted;
         and the rasterizer's `info`, for densification.
     """
-    render, alpha, info = composite(
-        view.projection,
-        appearance.colors,
-        appearance.opacities,
-        backgrounds=background[None] if image_of is None else None,
-        with_depth=with_depth,
-        absgrad=absgrad,
-        assume_finite=assume_finite,
-    )
+    behind = background[None] if image_of is None else None
+    options = {"with_depth": with_depth, "absgrad": absgrad, "assume_finite": assume_finite}
+    render, alpha, info = composite(view.projection, *appearance, backgrounds=behind, **options)
     render, alpha = render.squeeze(0), alpha.squeeze(0)  # the gradient of [0] would be a copy among zeros
     rgb = render[..., :-1] if with_depth else render
     if image_of is not None:
