@@ -19,10 +19,6 @@ MODEL = "nrfgs_ns.model.model:NrfgsModel"
 """The model's class, which imports this module."""
 PRIOR_VIEWS = 20
 """Training views with which the trust in the head, by `few_views`, is one half."""
-HALVING_VIEWS = 12
-"""Training views that halve `shrinkage`."""
-NEGLIGIBLE = 1e-6
-"""Smaller weights of shrinkage count as zero: Adam turns any into whole steps of splats that no view sees."""
 EPSILON = math.ulp(1.0)
 
 
@@ -103,8 +99,3 @@ class NrfgsModelConfig(ModelConfig):
         """The head's configuration for this number of training views, and for the densification."""
         head = self.appearance.trusted(self.trust(views))
         return head.for_copies() if self.densification.copies_splats else head
-
-    def shrinkage_weight(self, views: int) -> float:
-        """Weight of `shrinkage` in the loss with this number of training views, with what the densification adds."""
-        weight = (self.shrinkage * 0.5 ** (views / HALVING_VIEWS) + self.densification.shrinkage) / 100
-        return weight if weight >= NEGLIGIBLE and not self.densification.regularises else 0.0
