@@ -15,8 +15,6 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.densification import DensificationChoice, Splatfacto
 from nrfgs_ns.errors import InputError
 
-MODEL = "nrfgs_ns.model.model:NrfgsModel"
-"""The model's class, which imports this module."""
 PRIOR_VIEWS = 20
 """Training views with which the trust in the head, by `few_views`, is one half."""
 EPSILON = math.ulp(1.0)
@@ -26,7 +24,7 @@ EPSILON = math.ulp(1.0)
 class NrfgsModelConfig(ModelConfig):
     """Options of the model: this package's own, then those of splatfacto that are not the densification's."""
 
-    _target: type = field(default_factory=lambda: resolve_name(MODEL))
+    _target: type = field(default_factory=lambda: resolve_name("nrfgs_ns.model.model:NrfgsModel"))  # it imports this
     appearance: AppearanceHeadConfig = field(default_factory=NrfConfig)
     """the appearance head: what a splat's colour and opacity are, seen from a camera"""
     view_noise: float = 0.0
