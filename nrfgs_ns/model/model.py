@@ -249,9 +249,8 @@ class NrfgsModel(ExportedModel):
         if self.training:
             shown = appearance.opacities
             stored = noisy.splats["opacities"]
-            if view.every_row:
-                base = torch.sigmoid(stored).flatten()  # for splats that are not visible
-                shown = torch.where(info["radii"] > 0, shown, base)
+            if view.every_row:  # splats that are not visible have their stored opacity
+                shown = torch.where(info["radii"] > 0, shown, torch.sigmoid(stored).flatten())
             self.densification.pre_backward(self.step, info, shown, stored)
         return outputs, info
 
@@ -266,13 +265,9 @@ class NrfgsModel(ExportedModel):
         [3] or the configured one."""
         background = self._get_background_color() if background is None else background
         image_of = self.head.image_of if self.head.at_pixel else None
-        options = {"with_depth": not self.training, "absgrad": self.needs_absgrad, "assume_finite": self.training}
+        absgrad = self.training and self.densification.needs_absgrad(self.step)
+        options = {"with_depth": not self.training, "absgrad": absgrad, "assume_finite": self.training}
         return composite_view(view, appearance, background, image_of=image_of, look=look, **options)
-
-    @property
-    def needs_absgrad(self) -> bool:
-        """Whether densification needs absolute gradients of this step (`Densification.needs_absgrad`)."""
-        return self.training and self.densification.needs_absgrad(self.step)
 
     def render(self, field: Field, camera: Cameras, noisy: Field) -> dict[str, Tensor]:
         """Render any field as `get_outputs` renders the model's own; `noisy`: as its head sees it, with or without

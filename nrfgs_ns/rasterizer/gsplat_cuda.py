@@ -163,11 +163,9 @@ def _lists(projection: Projection, opacities: Tensor, side: int, by_gsplat: bool
 
         tables = (table.detach().contiguous() for table in (means2d, bounds, depths, conics, opacities))
         return tile_lists(*tables, tile_width, tile_height, split=side < TILE_SIZE)
-    images = {"n_cameras": projection.n_cameras, "camera_ids": projection.camera_ids}
-    if HAS_BATCHES:
-        images = {"n_images": projection.n_cameras, "image_ids": projection.camera_ids}
+    number, ids = ("n_images", "image_ids") if HAS_BATCHES else ("n_cameras", "camera_ids")
+    rows = {number: projection.n_cameras, ids: projection.camera_ids, "gaussian_ids": projection.gaussian_ids}
     tiles = side, tile_width, tile_height
-    rows = {"gaussian_ids": projection.gaussian_ids, **images}
     _, isect_ids, flatten_ids = isect_tiles(means2d, bounds, depths, *tiles, packed=True, **rows)
     return isect_offset_encode(isect_ids, projection.n_cameras, tile_width, tile_height), flatten_ids
 
