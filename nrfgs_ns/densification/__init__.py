@@ -22,9 +22,7 @@ from nrfgs_ns.errors import InputError
 __all__ = ["CHANGE", "STRATEGIES", "UNSEEN", "Densification", "DensificationChoice", "DensificationConfig"]
 __all__ += ["ErrorGuided", "Mcmc", "Original", "Splatfacto", "strategy_from"]
 
-STRATEGIES: dict[str, type[DensificationConfig]] = {
-    config.name: config for config in (Splatfacto, Original, Mcmc, ErrorGuided)
-}
+STRATEGIES = {config.name: config for config in (Splatfacto, Original, Mcmc, ErrorGuided)}
 
 
 def strategy_from(text: str) -> DensificationConfig:

@@ -24,6 +24,9 @@ from torch.nn.functional import normalize, pad
 
 from nrfgs_ns.appearance.head import SplatAppearance
 
+Look = Callable[[Tensor], Tensor]
+"""A photograph's exposure model: a rendered image [H, W, 3], not clamped -> as the photograph has it, in [0, 1]."""
+
 EPS2D = 0.3
 """Blur added to the 2D covariances, in square pixels."""
 TILE_SIZE = 16
@@ -178,7 +181,7 @@ def composite_view(
     absgrad: bool = False,
     assume_finite: bool = False,
     image_of: Callable[[Tensor, Tensor], Tensor] | None = None,
-    look: Callable[[Tensor], Tensor] | None = None,
+    look: Look | None = None,
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Composite the visible splats over a background.
 
@@ -190,7 +193,7 @@ def composite_view(
         absgrad, assume_finite: as in `composite`.
         image_of: a head at the pixel's (`AppearanceHead.image_of`). Features are composited over zero, and the image of
             them is drawn over the background with the splats' accumulated opacity. None: colours are the image's.
-        look: the photograph's exposure model, applied to the rendered image [H, W, 3]; None: clamp it to [0, 1].
+        look: the photograph's; None: clamp the rendered image to [0, 1].
 
     Returns:
         "rgb" [H, W, 3] in [0, 1], "accumulation" [H, W, 1], "background" [H, W, 3], and "depth" [H, W, 1] if wanted;
