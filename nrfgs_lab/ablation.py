@@ -144,7 +144,8 @@ class FieldViews:
 def row(part: str, group: str, field: Field, views: FieldViews, full: float | None) -> Row:
     """Measure one field; `full` is the full field's PSNR, None for the full field."""
     score = views.psnr(field)
-    return Row(part, group, score, 0.0 if full is None else full - score, field.bytes, views.head_seconds(field))
+    size = sum(value.nbytes for value in (*field.head.parameters(), *field.splats.values()))
+    return Row(part, group, score, 0.0 if full is None else full - score, size, views.head_seconds(field))
 
 
 def together(

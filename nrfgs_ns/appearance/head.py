@@ -192,11 +192,6 @@ class Field(NamedTuple):
         """The same field without gradients to the table."""
         return Field(self.head, {name: value.detach() for name, value in self.splats.items()})
 
-    @property
-    def bytes(self) -> int:
-        """Bytes that a renderer needs."""
-        return sum(value.nbytes for value in (*self.head.parameters(), *self.splats.values()))
-
 
 class ViewNoise:
     """Noise on the camera centre from which the head sees splats in training.

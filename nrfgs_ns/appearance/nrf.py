@@ -131,13 +131,9 @@ class NeuralResidualField(AppearanceHead):
         low = 1 + 3 + BAND_DIM  # alpha, d and band 0
         high = BAND_DIM * (config.num_bands - 1)  # the other bands
         outputs = 3 + int(config.opacity_residual)  # dc, d_alpha
-        self.high: nn.Sequential | None = None
-        if config.split_bands:
-            self.low = mlp(shared + low, config.hidden_width, outputs)
-            if high > 0:
-                self.high = mlp(shared + high, config.hidden_width, 3 + 1)  # dc, gate
-        else:
-            self.low = mlp(shared + low + high, 2 * config.hidden_width, outputs)
+        split, width = config.split_bands, config.hidden_width
+        self.low = mlp(shared + low, width, outputs) if split else mlp(shared + low + high, 2 * width, outputs)
+        self.high = mlp(shared + high, width, 3 + 1) if split and high > 0 else None  # dc, gate
         branches = [branch for branch in (self.low, self.high) if branch is not None]
         if config.output_init == "zero":
             for branch in branches:
@@ -146,7 +142,8 @@ class NeuralResidualField(AppearanceHead):
         self.fused = FusedField(config, branches)
 
     def try_kernels(self, device: torch.device) -> None:
-        self.fused.try_kernels(device)
+        if self.config.implementation != "torch":
+            self.fused.prepared_on(device)
 
     def splat_params(self, rgb: Tensor) -> dict[str, Tensor]:
         """Base colours and latents: "features_dc" [N, 3], "latents" [N, D] ~ N(0, LATENT_STD^2)."""

@@ -32,8 +32,6 @@ class LatentBasis(NamedTuple):
     """B, one component in each column, the strongest first. [D, D]"""
     inverse: Tensor
     """of B. [D, D]"""
-    variances: Tensor
-    """weighted variances of the components of y, descending. [D]"""
 
 
 def latent_basis(field: Field, weight: Tensor) -> LatentBasis:
@@ -57,9 +55,9 @@ def latent_basis(field: Field, weight: Tensor) -> LatentBasis:
     metric_root = (vectors * roots) @ vectors.T  # G^(1/2)
     inverse_root = (vectors / roots) @ vectors.T  # G^(-1/2)
     centred = (latents - mean) @ metric_root
-    variances, rotation = torch.linalg.eigh(centred.T @ (weight * centred))
+    _, rotation = torch.linalg.eigh(centred.T @ (weight * centred))
     rotation = rotation.flip(1)  # R: eigh's order is ascending
-    return LatentBasis(mean, inverse_root @ rotation, rotation.T @ metric_root, variances.flip(0).clamp_min(0.0))
+    return LatentBasis(mean, inverse_root @ rotation, rotation.T @ metric_root)
 
 
 def with_rank(field: Field, basis: LatentBasis, rank: int) -> Field:

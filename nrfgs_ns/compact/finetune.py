@@ -150,9 +150,8 @@ class CodedSplats(nn.Module):
         codes = grid.codes(values["means"].cpu().numpy()).clip(max=2**MOST_BITS - 1)
         order = torch.from_numpy(np.argsort(morton(codes), kind="stable")).to(values["means"].device)
         values = {name: table[order].float() for name, table in values.items()}
-        self.tables = nn.ModuleDict(
-            {name: Rounded(table, torch.from_numpy(steps[name]).to(table)) for name, table in values.items()}
-        )
+        tables = {name: Rounded(table, torch.from_numpy(steps[name]).to(table)) for name, table in values.items()}
+        self.tables = nn.ModuleDict(tables)
         self.density = Density(self._row(values))
         self.density_of_latents = Density(values["latents"])
 

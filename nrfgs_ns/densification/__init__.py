@@ -9,7 +9,6 @@ On the command line a strategy is one word, its name and options of its own: `mc
 they share.
 """
 
-from dataclasses import fields
 from typing import Annotated
 
 from tyro.constructors import PrimitiveConstructorSpec
@@ -23,9 +22,7 @@ from nrfgs_ns.errors import InputError
 __all__ = ["CHANGE", "STRATEGIES", "UNSEEN", "Densification", "DensificationChoice", "DensificationConfig"]
 __all__ += ["ErrorGuided", "Mcmc", "Original", "Splatfacto", "strategy_from"]
 
-STRATEGIES: dict[str, type[DensificationConfig]] = {
-    config.name: config for config in (Splatfacto, Original, Mcmc, ErrorGuided)
-}
+STRATEGIES = {config.name: config for config in (Splatfacto, Original, Mcmc, ErrorGuided)}
 
 
 def strategy_from(text: str) -> DensificationConfig:
@@ -38,12 +35,11 @@ def strategy_from(text: str) -> DensificationConfig:
     if name not in STRATEGIES:
         raise InputError(f"There is no strategy {name!r}; use one of {', '.join(STRATEGIES)}.")
     config = STRATEGIES[name]()
-    names = [field.name for field in fields(config)]
     for setting in settings:
         option, _, value = (part.strip() for part in setting.partition("="))
         option = option.replace("-", "_")
-        if option not in names:
-            raise InputError(f"{name} has no option {option!r}; it has {', '.join(names)}.")
+        if option not in vars(config):
+            raise InputError(f"{name} has no option {option!r}; it has {', '.join(vars(config))}.")
         kind = type(getattr(config, option))
         try:
             setattr(config, option, kind(value))

@@ -136,10 +136,8 @@ def split_evenly(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Ten
     return each.to(opacities.dtype), (factor[:, None] * scales).to(scales.dtype)
 
 
-_BINOMIALS = torch.tensor(
-    [[math.comb(n, k + 1) for k in range(MAX_COPIES)] for n in range(MAX_COPIES + 1)], dtype=torch.float64
-)
-"""binom(n, k + 1), [52, 51]."""
+_BINOMIALS = torch.tensor([[math.comb(n, k + 1) for k in range(MAX_COPIES)] for n in range(MAX_COPIES + 1)]).double()
+"""binom(n, k + 1), [52, 51]; all are below 2^53."""
 
 
 @torch.no_grad()

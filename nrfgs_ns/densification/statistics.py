@@ -29,21 +29,16 @@ def accumulate(tables: Statistics, info: Mapping[str, Any], extent: float, gradi
     """Update the tables, in place, by a step. Norms that are not finite count as 0.
 
     Args:
-        tables: tables of N splats.
+        tables: tables of N splats, dense and float32 on CUDA.
         info: the rasterizer's, of M rows; those of radius 0 belong to invisible splats.
         extent: width and height of the image in the units by which gradients are to be taken.
         gradients: the loss's gradients by the rows' centres in pixels, [M, 2].
     """
     cameras = info["n_cameras"]
     scales = info["width"] / extent * cameras, info["height"] / extent * cameras
-    tensors = [value for value in (*tables, gradients) if value is not None]
+    device = info["radii"].device
     update = in_torch
-    if (
-        tensors[0].is_cuda
-        and cameras == 1  # no row occurs twice
-        and all(tensor.dtype == torch.float32 and tensor.is_contiguous() for tensor in tensors)
-        and try_kernel(tensors[0].device)
-    ):
+    if device.type == "cuda" and cameras == 1 and try_kernel(device):  # of one camera no row occurs twice
         from nrfgs_ns.densification.statistics_triton import in_triton as update
     update(tables, info, scales, gradients)
 

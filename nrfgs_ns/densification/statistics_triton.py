@@ -49,7 +49,8 @@ def in_triton(
     count = len(info["gaussian_ids"])
     written = [table for table in tables if table is not None]
     if count > 0:
-        arguments = *tables, info["gaussian_ids"], info["radii"].contiguous(), gradients
+        dense = (value if value is None else value.contiguous() for value in (info["radii"], gradients))
+        arguments = *tables, info["gaussian_ids"], *dense
         arguments = (written[0] if value is None else value for value in arguments)  # a pointer that is not used
         wanted = {name.upper(): table is not None for name, table in tables._asdict().items()}
         grid = (-(-count // BLOCK),)

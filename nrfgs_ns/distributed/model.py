@@ -96,7 +96,8 @@ class ShardedModel(NrfgsModel):
         projection = self._project_everywhere(field.splats, pinholes)
         centers = torch.stack([one.center for one in pinholes]).index_select(0, projection.camera_ids)
         appearance = self.noisy(field).seen_from(View(projection, centers))
-        drawn, arrived = send_to_cameras(projection, appearance, *self.sizes[own], self.needs_absgrad)
+        absgrad = self.densification.needs_absgrad(self.step)
+        drawn, arrived = send_to_cameras(projection, appearance, *self.sizes[own], absgrad)
         look = self.look_of(self._photograph_of(cameras[own]))
         outputs, _ = self.composite(View(drawn, pinholes[own].center, pinhole=pinholes[own]), arrived, look=look)
         self.info = {name: getattr(projection, name) for name in ROWS}  # the image's rows are other devices' splats

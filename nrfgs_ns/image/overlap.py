@@ -131,7 +131,7 @@ def compare(sightings: Sequence[Sighting], centers: Tensor) -> Pairs:
     """Compare photographs, from their sightings [V] and camera centres [V, 3], with those taken next to them."""
     distance = torch.cdist(centers.double(), centers.double())
     distance.fill_diagonal_(torch.inf)
-    order = distance.argsort(dim=1)[:, : min(CANDIDATES, len(centers) - 1)].tolist() if len(centers) > 1 else []
+    order = distance.argsort(dim=1)[:, : min(CANDIDATES, len(centers) - 1)].tolist()
     nearest = [[(min(a, b), max(a, b)) for b in row] for a, row in enumerate(order)]
     shift_of = functools.cache(lambda pair: _shift(*(sightings[photograph] for photograph in pair)))
     compared = {}  # on one thread: the operations are small, and several threads would wait for Python's lock
@@ -145,16 +145,14 @@ def compare(sightings: Sequence[Sighting], centers: Tensor) -> Pairs:
 
 def _shift(first: Sighting, second: Sighting) -> tuple[Tensor, Tensor] | None:
     """Shift from the first to the second and disagreement of the regions, [3] each; None: too few common points."""
-    if min(len(first.points), len(second.points)) < FEWEST_POINTS * FEWEST_REGIONS:
+    points = first.points.numpy(), second.points.numpy()
+    _, here, there = np.intersect1d(*points, assume_unique=True, return_indices=True)
+    if len(here) < FEWEST_POINTS * FEWEST_REGIONS:
         return None
-    place = torch.searchsorted(second.points, first.points).clamp_max(len(second.points) - 1)
-    common = (second.points[place] == first.points).nonzero()[:, 0]
-    if len(common) < FEWEST_POINTS * FEWEST_REGIONS:
-        return None
-    light = second.light[place[common]] - first.light[common]
+    light = second.light[there] - first.light[here]
     red, green, blue = light.unbind(dim=-1)
     columns = torch.stack([light.mean(dim=-1), red - green, blue - green], dim=-1)
-    region, order = first.region[common].sort()
+    region, order = first.region[here].sort()
     inside = columns[order].split(region.bincount().tolist())
     medians = [lights.median(dim=0).values for lights in inside if len(lights) >= FEWEST_POINTS]
     if len(medians) < FEWEST_REGIONS:
@@ -207,8 +205,7 @@ def estimate(pairs: Pairs, known: Tensor, centers: Tensor) -> Looks:
     count = len(known)
     expected = torch.zeros(count, 3, dtype=torch.float64)
     there = torch.isfinite(known)
-    if there.any():
-        expected[there, 0] = slope(pairs, known) * (known[there] - known[there].mean()).double()
+    expected[there, 0] = slope(pairs, known) * (known[there] - known[there].mean()).double()
     usual = USUAL_STOPS
     random = [0.0, 0.0, 0.0]
     places = None

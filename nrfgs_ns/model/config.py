@@ -15,14 +15,8 @@ from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.densification import DensificationChoice, Splatfacto
 from nrfgs_ns.errors import InputError
 
-MODEL = "nrfgs_ns.model.model:NrfgsModel"
-"""The model's class, which imports this module."""
 PRIOR_VIEWS = 20
 """Training views with which the trust in the head, by `few_views`, is one half."""
-HALVING_VIEWS = 12
-"""Training views that halve `shrinkage`."""
-NEGLIGIBLE = 1e-6
-"""Smaller weights of shrinkage count as zero: Adam turns any into whole steps of splats that no view sees."""
 EPSILON = math.ulp(1.0)
 
 
@@ -30,7 +24,7 @@ EPSILON = math.ulp(1.0)
 class NrfgsModelConfig(ModelConfig):
     """Options of the model: this package's own, then those of splatfacto that are not the densification's."""
 
-    _target: type = field(default_factory=lambda: resolve_name(MODEL))
+    _target: type = field(default_factory=lambda: resolve_name("nrfgs_ns.model.model:NrfgsModel"))  # it imports this
     appearance: AppearanceHeadConfig = field(default_factory=NrfConfig)
     """the appearance head: what a splat's colour and opacity are, seen from a camera"""
     view_noise: float = 0.0
@@ -103,8 +97,3 @@ class NrfgsModelConfig(ModelConfig):
         """The head's configuration for this number of training views, and for the densification."""
         head = self.appearance.trusted(self.trust(views))
         return head.for_copies() if self.densification.copies_splats else head
-
-    def shrinkage_weight(self, views: int) -> float:
-        """Weight of `shrinkage` in the loss with this number of training views, with what the densification adds."""
-        weight = (self.shrinkage * 0.5 ** (views / HALVING_VIEWS) + self.densification.shrinkage) / 100
-        return weight if weight >= NEGLIGIBLE and not self.densification.regularises else 0.0

@@ -9,6 +9,11 @@ from torch import Tensor
 
 from nrfgs_ns.image.ssim import photometric_loss
 
+HALVING_VIEWS = 12
+"""Training views that halve the model's `shrinkage`."""
+NEGLIGIBLE = 1e-6
+"""Smaller weights of shrinkage count as zero: Adam turns any into whole steps of splats that no view sees."""
+
 
 def loss_of(
     model, splats: Mapping[str, Tensor], outputs: Mapping[str, Any], batch: Mapping[str, Any], is_between: bool = False
@@ -47,9 +52,11 @@ def photometric(model, outputs: Mapping[str, Any], batch: Mapping[str, Any], is_
 
 
 def shrinkage(model, splats: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Terms for the splats' mean opacity, and mean size in scene units, unless their weight is zero."""
-    weight = model.config.shrinkage_weight(model.num_views)
-    if weight == 0.0:
+    """Terms for the splats' mean opacity, and mean size in scene units, unless their weight is zero or the strategy has
+    its own."""
+    own, added = model.config.shrinkage, model.config.densification
+    weight = (own * 0.5 ** (model.num_views / HALVING_VIEWS) + added.shrinkage) / 100
+    if weight < NEGLIGIBLE or added.regularises:
         return {}
     return {
         "shrink_opacities": weight * model.densification.mean_opacity(splats["opacities"]),

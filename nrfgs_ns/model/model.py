@@ -8,7 +8,7 @@ objects that the optimisers hold, so that an interrupted training can go on.
 """
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -35,7 +35,7 @@ from nrfgs_ns.model.loss import loss_of
 from nrfgs_ns.model.pinholes import Pinholes, pinhole
 from nrfgs_ns.model.saved_state import check_compatible, differences, photographs_of, reduced_config
 from nrfgs_ns.model.warmup import warm_up
-from nrfgs_ns.rasterizer import Pinhole, ProjectionOptions, View, composite_view, project_view
+from nrfgs_ns.rasterizer import Look, Pinhole, ProjectionOptions, View, composite_view, project_view
 
 NEAR_SHARE = 0.5
 """Near plane of `near_plane` auto, in the depth of the nearest points (`data.views.nearest_depth`)."""
@@ -228,7 +228,7 @@ class NrfgsModel(ExportedModel):
             raise InputError(f"{LOOK} is {name!r}, which is not a training photograph, such as {names[0]!r}.")
         return names.index(name)
 
-    def look_of(self, index: int | None) -> Callable[[Tensor], Tensor] | None:
+    def look_of(self, index: int | None) -> Look | None:
         """The learnt exposure model of the photograph `index`, for `composite_view`; None: the mean of all."""
         return None if index is None or self.photograph is None else lambda rgb: self.photograph(rgb, index)
 
@@ -238,7 +238,7 @@ class NrfgsModel(ExportedModel):
         return field._replace(splats=self.view_noise.moved(field.splats, noise))
 
     def render_view(
-        self, view: View, noisy: Field, look: Callable[[Tensor], Tensor] | None, is_between: bool = False
+        self, view: View, noisy: Field, look: Look | None, is_between: bool = False
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """`composite_view` of a field as its head sees it (`noisy`), with a look (`look_of`): in evaluation, in the
         eager and in the recorded step. In training, densification looks at it. `is_between`: over what a twin's picture
@@ -249,30 +249,21 @@ class NrfgsModel(ExportedModel):
         if self.training:
             shown = appearance.opacities
             stored = noisy.splats["opacities"]
-            if view.every_row:
-                base = torch.sigmoid(stored).flatten()  # for splats that are not visible
-                shown = torch.where(info["radii"] > 0, shown, base)
+            if view.every_row:  # splats that are not visible have their stored opacity
+                shown = torch.where(info["radii"] > 0, shown, torch.sigmoid(stored).flatten())
             self.densification.pre_backward(self.step, info, shown, stored)
         return outputs, info
 
     def composite(
-        self,
-        view: View,
-        appearance: SplatAppearance,
-        background: Tensor | None = None,
-        look: Callable[[Tensor], Tensor] | None = None,
+        self, view: View, appearance: SplatAppearance, background: Tensor | None = None, look: Look | None = None
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """`composite_view` of any appearance as this model is configured, with a look (`look_of`), over a background
         [3] or the configured one."""
         background = self._get_background_color() if background is None else background
         image_of = self.head.image_of if self.head.at_pixel else None
-        options = {"with_depth": not self.training, "absgrad": self.needs_absgrad, "assume_finite": self.training}
+        absgrad = self.training and self.densification.needs_absgrad(self.step)
+        options = {"with_depth": not self.training, "absgrad": absgrad, "assume_finite": self.training}
         return composite_view(view, appearance, background, image_of=image_of, look=look, **options)
-
-    @property
-    def needs_absgrad(self) -> bool:
-        """Whether densification needs absolute gradients of this step (`Densification.needs_absgrad`)."""
-        return self.training and self.densification.needs_absgrad(self.step)
 
     def render(self, field: Field, camera: Cameras, noisy: Field) -> dict[str, Tensor]:
         """Render any field as `get_outputs` renders the model's own; `noisy`: as its head sees it, with or without
@@ -286,7 +277,7 @@ class NrfgsModel(ExportedModel):
         view = self.project(camera)
         return self.composite(view, self.field.base_of(view))[0]["rgb"]
 
-    def picture(self, view: View, field: Field, look: Callable[[Tensor], Tensor] | None) -> Tensor:
+    def picture(self, view: View, field: Field, look: Look | None) -> Tensor:
         """A rendering as a photograph for a twin (`training/twin.py`), uint8 [H, W, 4], transparent where nothing is
         drawn; [H, W, 3] over black where photographs' exposures are learnt, which are not of transparent ones."""
         outputs, _ = self.composite(view, field.seen_from(view), torch.zeros(3, device=self.device), look)

@@ -22,8 +22,7 @@ def reduced_config(config: AppearanceHeadConfig, state: Mapping[str, Any]) -> Ap
 
 def differences(config: AppearanceHeadConfig, other: AppearanceHeadConfig) -> dict[str, Any]:
     """The options by which `other`, of the same head, differs from `config`, as `reduced_config` takes them."""
-    names = [field.name for field in fields(config)]
-    return {name: getattr(other, name) for name in names if getattr(other, name) != getattr(config, name)}
+    return {name: value for name, value in vars(other).items() if value != getattr(config, name)}
 
 
 def photographs_of(state: Mapping[str, Any]) -> PhotographModel | None:

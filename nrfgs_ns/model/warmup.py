@@ -40,7 +40,6 @@ def warm_up(model, cameras: Cameras, steps: int) -> None:
         if not model.warms_up:
             fix = "Use one, or --pipeline.model.warmup-steps 0."
             raise InputError(f"The head starts with a residual, and is warmed up on one device only. {fix}")
-        for weight, gradient in zip(weights, torch.autograd.grad(loss, weights), strict=True):
-            weight.grad = gradient
+        loss.backward(inputs=weights)
         optimizer.step()
-    optimizer.zero_grad(set_to_none=True)
+        optimizer.zero_grad(set_to_none=True)

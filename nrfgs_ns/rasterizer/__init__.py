@@ -24,7 +24,8 @@ from torch.nn.functional import normalize, pad
 
 from nrfgs_ns.appearance.head import SplatAppearance
 
-RasterizeMode = Literal["classic", "antialiased"]
+Look = Callable[[Tensor], Tensor]
+"""A photograph's exposure model: a rendered image [H, W, 3], not clamped -> as the photograph has it, in [0, 1]."""
 
 EPS2D = 0.3
 """Blur added to the 2D covariances, in square pixels."""
@@ -36,7 +37,7 @@ TILE_SIZE = 16
 class ProjectionOptions:
     """Options of a projection. Its planes are splatfacto's where a scene unit is a world unit."""
 
-    rasterize_mode: RasterizeMode = "classic"
+    rasterize_mode: Literal["classic", "antialiased"] = "classic"
     """classic: the blur makes splats wider. antialiased: it also makes them fainter, so that their light is kept"""
     near_plane: float = 0.01
     """smallest visible depth, in world units"""
@@ -180,7 +181,7 @@ def composite_view(
     absgrad: bool = False,
     assume_finite: bool = False,
     image_of: Callable[[Tensor, Tensor], Tensor] | None = None,
-    look: Callable[[Tensor], Tensor] | None = None,
+    look: Look | None = None,
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Composite the visible splats over a background.
 
@@ -192,21 +193,15 @@ def composite_view(
         absgrad, assume_finite: as in `composite`.
         image_of: a head at the pixel's (`AppearanceHead.image_of`). Features are composited over zero, and the image of
             them is drawn over the background with the splats' accumulated opacity. None: colours are the image's.
-        look: the photograph's exposure model, applied to the rendered image [H, W, 3]; None: clamp it to [0, 1].
+        look: the photograph's; None: clamp the rendered image to [0, 1].
 
     Returns:
         "rgb" [H, W, 3] in [0, 1], "accumulation" [H, W, 1], "background" [H, W, 3], and "depth" [H, W, 1] if wanted;
         and the rasterizer's `info`, for densification.
     """
-    render, alpha, info = composite(
-        view.projection,
-        appearance.colors,
-        appearance.opacities,
-        backgrounds=background[None] if image_of is None else None,
-        with_depth=with_depth,
-        absgrad=absgrad,
-        assume_finite=assume_finite,
-    )
+    behind = background[None] if image_of is None else None
+    options = {"with_depth": with_depth, "absgrad": absgrad, "assume_finite": assume_finite}
+    render, alpha, info = composite(view.projection, *appearance, backgrounds=behind, **options)
     render, alpha = render.squeeze(0), alpha.squeeze(0)  # the gradient of [0] would be a copy among zeros
     rgb = render[..., :-1] if with_depth else render
     if image_of is not None:

@@ -41,20 +41,22 @@ def project(geometry: tuple[Tensor, ...], cameras: tuple, options: ProjectionOpt
     """See `nrfgs_ns.rasterizer.project`: means, quats, scales; viewmats, Ks, width, height.
 
     gsplat lets NaN pass its tests for visibility: a head would turn such a row into NaN gradients of shared weights.
-    Then the projection is repeated without those splats. The check costs three sums and one wait, right after gsplat's.
+    Then the projection is repeated without those splats. The check costs three sums, which may overflow by themselves,
+    and one wait, right after gsplat's.
     """
     if options.every_row:
         return _every_row(geometry, cameras, options)
     rows = _visible_rows(geometry, cameras, options)
-    if not (options.assume_finite or _finite(rows)):
+    if not options.assume_finite:
         _, gaussian_ids, _, means2d, depths, conics, _, _ = rows
-        bad = ~torch.isfinite(torch.cat([means2d, depths[:, None], conics], dim=1)).all(dim=1)
-        keep = torch.ones(len(geometry[0]), dtype=torch.bool, device=gaussian_ids.device)
-        keep[gaussian_ids[bad]] = False
-        kept = keep.nonzero().squeeze(1)
-        geometry = tuple(table.index_select(0, kept) for table in geometry)
-        camera_ids, gaussian_ids, *others = _visible_rows(geometry, cameras, options)
-        rows = (camera_ids, kept.index_select(0, gaussian_ids), *others)
+        if not torch.isfinite(means2d.detach().sum() + depths.detach().sum() + conics.detach().sum()):
+            bad = ~torch.isfinite(torch.cat([means2d, depths[:, None], conics], dim=1)).all(dim=1)
+            keep = torch.ones(len(geometry[0]), dtype=torch.bool, device=gaussian_ids.device)
+            keep[gaussian_ids[bad]] = False
+            kept = keep.nonzero().squeeze(1)
+            geometry = tuple(table.index_select(0, kept) for table in geometry)
+            camera_ids, gaussian_ids, *others = _visible_rows(geometry, cameras, options)
+            rows = (camera_ids, kept.index_select(0, gaussian_ids), *others)
     *columns, extents = rows
     viewmats, _, width, height = cameras
     return Projection(*columns, width=width, height=height, n_cameras=len(viewmats), extents=extents)
@@ -88,12 +90,6 @@ def _packed_radii(radii: Tensor, conics: Tensor) -> Tensor:
     middle = 0.5 * (a + c) / det
     largest = middle + torch.sqrt(torch.clamp_min(middle * middle - 1.0 / det, 0.1))
     return torch.where(radii > 0, torch.ceil(3.0 * torch.sqrt(largest)), 0.0).to(torch.int32)
-
-
-def _finite(rows: tuple) -> bool:
-    """Whether the projected numbers are finite; False also if only their sum is not."""
-    _, _, _, means2d, depths, conics, _, _ = rows
-    return bool(torch.isfinite(means2d.detach().sum() + depths.detach().sum() + conics.detach().sum()))
 
 
 def _visible_rows(geometry: tuple[Tensor, ...], cameras: tuple, options: ProjectionOptions) -> tuple:
@@ -167,11 +163,9 @@ def _lists(projection: Projection, opacities: Tensor, side: int, by_gsplat: bool
 
         tables = (table.detach().contiguous() for table in (means2d, bounds, depths, conics, opacities))
         return tile_lists(*tables, tile_width, tile_height, split=side < TILE_SIZE)
-    images = {"n_cameras": projection.n_cameras, "camera_ids": projection.camera_ids}
-    if HAS_BATCHES:
-        images = {"n_images": projection.n_cameras, "image_ids": projection.camera_ids}
+    number, ids = ("n_images", "image_ids") if HAS_BATCHES else ("n_cameras", "camera_ids")
+    rows = {number: projection.n_cameras, ids: projection.camera_ids, "gaussian_ids": projection.gaussian_ids}
     tiles = side, tile_width, tile_height
-    rows = {"gaussian_ids": projection.gaussian_ids, **images}
     _, isect_ids, flatten_ids = isect_tiles(means2d, bounds, depths, *tiles, packed=True, **rows)
     return isect_offset_encode(isect_ids, projection.n_cameras, tile_width, tile_height), flatten_ids
 
@@ -179,13 +173,8 @@ def _lists(projection: Projection, opacities: Tensor, side: int, by_gsplat: bool
 def _kernels_take(projection: Projection, opacities: Tensor) -> bool:
     """Whether the kernels of `tile_lists.py` make the lists, of at least one splat."""
     tiles = -(-projection.width // TILE_SIZE) * (-(-projection.height // TILE_SIZE) + 1)  # with the row below the image
-    return (
-        projection.n_cameras == 1
-        and len(opacities) > 0
-        and tiles <= MOST_TILES
-        and opacities.dtype == projection.means2d.dtype == torch.float32
-        and _kernels_run_on(opacities.device)
-    )
+    is_one_image = projection.n_cameras == 1 and tiles <= MOST_TILES
+    return is_one_image and len(opacities) > 0 and _kernels_run_on(opacities.device)
 
 
 @tried_once("The list of each tile's splats")

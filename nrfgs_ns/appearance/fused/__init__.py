@@ -44,11 +44,6 @@ class FusedField:
         float32 = all(splats[name].dtype == torch.float32 for name in TABLES)
         return wanted and float32 and self.prepared_on(device) is not None
 
-    def try_kernels(self, device: torch.device) -> None:
-        """Try the kernels on a CUDA device, unless the configuration asks for PyTorch."""
-        if self.config.implementation != "torch":
-            self.prepared_on(device)
-
     def __call__(
         self, splats: Mapping[str, Tensor], visible: Tensor, camera_centers: Tensor, scene_unit: float
     ) -> tuple[Tensor, Tensor]:

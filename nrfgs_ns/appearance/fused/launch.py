@@ -7,7 +7,6 @@ to zero the tables' gradients unless every splat is visible, one backward, two t
 
 import functools
 import math
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -103,7 +102,8 @@ class FusedFunction(torch.autograd.Function):
                 opacities, visible, centers, *weights):  # fmt: skip
         tables = [_contiguous(table) for table in (means, latents, features_dc, opacities)]
         visible, centers = _contiguous(visible), _contiguous(centers)
-        packed = _packed(packing, weights)
+        flat = [weight.detach().reshape(-1) for weight in weights]
+        packed = torch.cat([*flat, _zero(visible.device)]).index_select(0, packing.gather)  # as the kernels read them
         launch = launches.forward
         count = len(visible)
         outputs = packed.new_empty(count, 3), packed.new_empty(count)
@@ -146,12 +146,6 @@ class FusedFunction(torch.autograd.Function):
         flat = sums.index_select(0, packing.scatter).split([shape.numel() for shape in packing.shapes])
         d_weights = [d.view(shape) for d, shape in zip(flat, packing.shapes, strict=True)]
         return None, None, None, None, *d_tables, None, d_centers if wants_center else None, *d_weights
-
-
-def _packed(packing: Packing, weights: Sequence[Tensor]) -> Tensor:
-    """The shared weights as the kernels read them."""
-    flat = [weight.detach().reshape(-1) for weight in weights]
-    return torch.cat([*flat, _zero(flat[0].device)]).index_select(0, packing.gather)
 
 
 def _constants(packing: Packing, launch: Launch, config, one_center: bool) -> dict[str, Any]:
