@@ -161,22 +161,19 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
 
     def train_view(self, index: int) -> tuple[Cameras, dict[str, Any]]:
         """A training camera, [1] on the device with "cam_idx" in its metadata, and its photograph by `get_data`."""
-        return self._view(index), self._image(index)
+        batch = self.cached_train[index]
+        return self._view(index), batch | {"image": batch["image"].to(self.device)}
 
     def next_train_views(self, count: int, own: int) -> tuple[list[Cameras], dict[str, Any]]:
         """The next `count` training cameras in turn, [1] each, and the photograph of the one at position `own`."""
         indices = [self._next_index() for _ in range(count)]
-        return [self._view(index) for index in indices], self._image(indices[own])
+        return [self._view(index) for index in indices], self.train_view(indices[own])[1]
 
     def _next_index(self) -> int:
         index = self.train_unseen_cameras.pop(0)
         if len(self.train_unseen_cameras) == 0:
             self.train_unseen_cameras = self.sample_train_cameras()
         return index
-
-    def _image(self, index: int) -> dict[str, Any]:
-        batch = self.cached_train[index]
-        return batch | {"image": batch["image"].to(self.device)}
 
     def _view(self, index: int) -> Cameras:
         if index not in self._views:
@@ -262,7 +259,7 @@ def from_cache(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
             fix = "Make room, set XDG_CACHE_HOME to another folder, or give more --pipeline.datamanager.image-memory."
             raise InputError(f"{path} cannot be written ({error}). {fix}") from error
         content = torch.load(path, mmap=True, weights_only=True)
-    return {"image_idx": index} | {name: content[name] for name in IMAGES if name in content}
+    return {"image_idx": index} | content
 
 
 def _cache_file(dataset: Any, index: int, image_type: str) -> Path:
