@@ -22,7 +22,7 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import InputError, refusing
 from nrfgs_ns.files import write_whole
 from nrfgs_prepare import pairs, structure
 from nrfgs_prepare import photos as files
@@ -86,10 +86,8 @@ class Run:
         self.source = str(options.photos.resolve())
         if self.out.exists() and not file.is_file() and (self.out.is_file() or any(self.out.iterdir())):
             raise InputError(f"{self.out} exists and was not made by `nrfgs prepare`. Name a new or an empty folder.")
-        try:
+        with refusing(f"{file} is damaged", f"Delete {self.out} and begin again.", ValueError, TypeError):
             self.state: dict[str, Any] = dict(json.loads(file.read_text())) if file.is_file() else {}
-        except (ValueError, TypeError) as error:
-            raise InputError(f"{file} is damaged ({error}). Delete {self.out} and begin again.") from error
         self.key = self.digest = files.digest(self.inputs)
         if self.state.get("digest", self.digest) != self.digest and (other := self.state.get("source")) != self.source:
             fix = "Name another folder, or delete this one."

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
-from nrfgs_ns.data.pictures import NUMBERS, check_depth, exif_of, is_heif, naming, open_picture, read_exif, read_size
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.data.pictures import NUMBERS, RESTORE, check_depth, exif_of, is_heif, open_picture, read_exif, read_size
+from nrfgs_ns.errors import InputError, refusing
 from nrfgs_prepare.pairs import Advance
 
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif")
@@ -107,7 +107,7 @@ def _store(image: Image.Image, path: Path, target: Path) -> None:
     check_depth(image, path)
     if min(image.size) < SMALLEST:
         raise InputError(f"{path} is {image.width} x {image.height} pixels, too small to show anything. Remove it.")
-    with naming(path, "cannot be decoded"):
+    with refusing(f"{path} cannot be decoded", RESTORE, Exception):
         image.load()
     exif = exif_of(image)
     upright = exif.get(ExifTags.Base.Orientation, 1) == 1

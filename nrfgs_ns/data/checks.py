@@ -18,10 +18,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from nrfgs_ns.data.pictures import read_size
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import InputError, shown
 
-SHOWN, LONGEST = 3, 160
-"""Items that a message lists before it counts the rest, and characters of each."""
+SHOWN = 3
+"""Items that a message lists before it counts the rest."""
 PIXELS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 """nerfstudio's order of the parameters."""
@@ -53,12 +53,6 @@ def some(items: Sequence[Any]) -> str:
     """The first few items for a message, and the number of the others."""
     rest = f" and {len(items) - SHOWN} more" if len(items) > SHOWN else ""
     return ", ".join(shown(str(item)) for item in items[:SHOWN]) + rest
-
-
-def shown(value: Any) -> str:
-    """A value from a file for a message: one printable line of bounded length."""
-    text = value if isinstance(value, str) and value.isprintable() else ascii(value)
-    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]}...{text[-LONGEST // 2 :]}"
 
 
 def number(value: Any) -> float:

@@ -14,7 +14,7 @@ from nrfgs_ns.data.checks import check_frames
 from nrfgs_ns.data.colmap import read_frames
 from nrfgs_ns.data.dataparser import NrfgsDataParser
 from nrfgs_ns.data.splits import Named
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import InputError, refusing
 
 UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """nerfstudio's turn of COLMAP's world, whose y points downwards, to one whose z points upwards."""
@@ -59,10 +59,8 @@ class NrfgsColmapDataParser(NrfgsDataParser):
         for split, file in LISTS:
             path = self._folder / f"{file}_list.txt"
             if path.is_file():
-                try:
+                with refusing(f"{path} cannot be read", "Write one image name on each line.", OSError, ValueError):
                     lines = path.read_text(encoding="utf-8").splitlines()
-                except (OSError, ValueError) as error:
-                    raise InputError(f"{path} cannot be read ({error}). Write one image name on each line.") from error
                 named[split] = path.name, [line.strip() for line in lines if line.strip()]
         return named
 

@@ -34,7 +34,7 @@ from nrfgs_ns.data.dataparser import NrfgsDataParser, NrfgsDataParserConfig
 from nrfgs_ns.data.lenses import LENS, undistorted_cameras
 from nrfgs_ns.data.pictures import cache_folder, in_parallel, read_mask, read_picture
 from nrfgs_ns.data.views import different_views, nearest_depth, scene_unit
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import InputError, refusing
 from nrfgs_ns.files import whole
 
 IMAGES = "image", "mask"
@@ -252,12 +252,9 @@ def from_cache(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
     except Exception:  # missing, or cut, as cleaners of caches leave them
         data = dataset.get_data(index, image_type)
         content = {name: data[name].contiguous() for name in IMAGES if name in data}
-        try:
-            with whole(path) as unfinished:
-                torch.save(content, unfinished)
-        except (OSError, RuntimeError) as error:  # torch raises RuntimeError where the disk is full
-            fix = "Make room, set XDG_CACHE_HOME to another folder, or give more --pipeline.datamanager.image-memory."
-            raise InputError(f"{path} cannot be written ({error}). {fix}") from error
+        fix = "Make room, set XDG_CACHE_HOME to another folder, or give more --pipeline.datamanager.image-memory."
+        with refusing(f"{path} cannot be written", fix, OSError, RuntimeError), whole(path) as unfinished:
+            torch.save(content, unfinished)  # raises RuntimeError where the disk is full
         content = torch.load(path, mmap=True, weights_only=True)
     return {"image_idx": index} | content
 

@@ -23,13 +23,13 @@ from nerfstudio.utils.poses import to4x4
 from torch import Tensor
 
 from nrfgs_ns.data import checks
-from nrfgs_ns.data.checks import PIXELS, SMALLEST, find_colmap, shown, warn
+from nrfgs_ns.data.checks import PIXELS, SMALLEST, find_colmap, warn
 from nrfgs_ns.data.colmap import read_points
 from nrfgs_ns.data.lenses import check_distortions
 from nrfgs_ns.data.pictures import known_exif, read_size
 from nrfgs_ns.data.points import check_sight, finite, in_reach, read_ply
 from nrfgs_ns.data.splits import SPLITS, STAND_INS, Named, Rows, split_by_names, split_by_rule
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import InputError, refusing, shown
 from nrfgs_ns.start import with_data_parsers
 
 with_data_parsers()
@@ -347,10 +347,9 @@ def read_transforms(data: Path) -> tuple[dict[str, Any], Path]:
         raise InputError(f"{source} is missing. {fix}")
     if source.stat().st_size > LONGEST_JSON:
         raise InputError(f"{source} is larger than {LONGEST_JSON} bytes. Make it anew.")
-    try:
+    fix = "Repair the file or make it anew."
+    with refusing(f"{source} cannot be read as JSON", fix, OSError, ValueError, RecursionError):
         meta = json.loads(source.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{source} cannot be read as JSON: {error}. Repair the file or make it anew.") from error
     frames = meta.get("frames") if isinstance(meta, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise InputError(f"{source}: `frames` must be a non-empty list of objects. Make the file anew.")

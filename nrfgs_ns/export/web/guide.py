@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import InputError, refusing
 
 VIEWS_A_SECOND = 5
 """Views kept of a camera path; the page puts a smooth curve through them."""
@@ -105,10 +105,8 @@ def _numbers(values: Any, count: int, where: str) -> list[float]:
 
 
 def _json(file: Path) -> dict[str, Any]:
-    try:
+    with refusing(f"{file} cannot be read as JSON", "A page's Save button writes one.", OSError, ValueError):
         content = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file} cannot be read as JSON ({error}).") from error
     if not isinstance(content, dict):
         raise InputError(f"{file} holds no JSON object. A page's Save button writes one.")
     return content
