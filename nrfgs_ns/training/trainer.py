@@ -30,11 +30,12 @@ from nrfgs_ns.training.guard import Guard, TrainingStopped
 from nrfgs_ns.training.identity import check_options, options_of
 from nrfgs_ns.training.optimizers import LeanOptimizers
 from nrfgs_ns.training.pace import Pace, TimedPace, resume
+from nrfgs_ns.training.pipeline import descend
 from nrfgs_ns.training.progress import ProgressLine, end_earlier_logs
 from nrfgs_ns.training.step_graph import StepGraphs
 from nrfgs_ns.training.stopping import StopRequest, heard_signals, is_out_of_memory, rows_agree
 from nrfgs_ns.training.trainer_config import NrfgsTrainerConfig, report_choices
-from nrfgs_ns.training.twin import Twin, descend, twin_of
+from nrfgs_ns.training.twin import Twin, twin_of
 
 NOTHING_TO_SAVE = "Stopped before the first step; there is nothing to save."
 

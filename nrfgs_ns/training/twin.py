@@ -19,12 +19,12 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
-from torch.nn import Parameter
 
 from nrfgs_ns.data.views import camera_spacing
 from nrfgs_ns.model.loss import loss_of
 from nrfgs_ns.training.guard import Guard
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
+from nrfgs_ns.training.pipeline import Gradients, descend
 from nrfgs_ns.training.step_graph import StepGraphs
 
 START = 6_000
@@ -44,8 +44,6 @@ PULLED = "means", "scales", "quats", "opacities", "features_dc"
 since two networks would drift in colour together; harmonics do not (results/twin.json)."""
 JITTER = 0.25
 """Standard deviation of a view's distance from the line between two cameras, in distances between neighbours."""
-
-Gradients = dict[Parameter, Tensor]
 
 
 class Between:
@@ -156,30 +154,6 @@ def twin_of(trainer) -> Twin | None:
     suits = every < RAREST and is_long and model.device.type == "cuda" and model.camera_optimizer.config.mode == "off"
     is_wanted = model.config.twin == "on" or model.config.twin == "auto" and suits
     return Twin(trainer, every) if is_wanted else None
-
-
-def descend(training, step: int, pulled: Gradients, with_metrics: bool = False) -> tuple[Tensor, dict, dict]:
-    """Make the step of a trainer or of a twin, down the loss of its next photograph.
-
-    Args:
-        training: has `pipeline`, `guard`, `optimizers`, `graphs` (None: steps are not recorded) and `world_size`.
-        pulled: added to the gradients.
-
-    Returns:
-        the loss, its terms, and metrics if wanted.
-    """
-    optimizers = training.optimizers
-    training.guard.begin(step, optimizers, settled_later=training.graphs is not None)
-    optimizers.zero_grad_all()
-    _, losses, metrics = training.pipeline.get_train_loss_dict(step, training.graphs, with_metrics)
-    loss = functools.reduce(torch.add, losses.values())
-    if loss.requires_grad:  # a recorded step has made its gradients already
-        loss.backward(torch.full_like(loss, 1.0 / training.world_size))  # the mean of the devices' losses
-    for parameter, gradient in pulled.items():
-        parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
-    training.guard.before_optimizers(optimizers)
-    optimizers.step()
-    return loss, losses, metrics
 
 
 def pull(training, view: Cameras, seen: Tensor, step: int) -> Gradients:

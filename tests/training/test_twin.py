@@ -14,7 +14,8 @@ from nrfgs_ns.image.ssim import photometric_loss
 from nrfgs_ns.training import twin
 from nrfgs_ns.training.checkpoint_files import read_latest
 from nrfgs_ns.training.guard import TrainingStopped
-from nrfgs_ns.training.twin import descend, picture, pull
+from nrfgs_ns.training.pipeline import descend
+from nrfgs_ns.training.twin import picture, pull
 
 BESIDE = {"--pipeline.model.twin": "on", **REFINING}
 
