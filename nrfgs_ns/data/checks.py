@@ -156,6 +156,12 @@ def _check_model(meta: dict[str, Any], source: Path) -> None:
                 )
 
 
+def _is_affine(pose: np.ndarray) -> bool:
+    """Whether an array is a 4 x 4 matrix of finite numbers with the last row 0 0 0 1."""
+    finite = pose.shape == (4, 4) and np.isfinite(pose).all()
+    return finite and np.allclose(pose[3], (0, 0, 0, 1), rtol=0, atol=LAST_ROW_TOLERANCE)
+
+
 def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -> np.ndarray:
     """Rigid camera-to-world matrices, float64 [V, 4, 4]; with `need_spread`, not all at one place."""
     names = np.array([frame["file_path"] for frame in frames])
@@ -166,14 +172,8 @@ def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -
             where = some(names[np.flatnonzero(bad)])
             raise InputError(f"{source}: transform_matrix of {where} {finding}, or remove the frame.")
 
-    last_row = (0, 0, 0, 1)
-    reject(
-        [
-            pose.shape != (4, 4) or not np.isfinite(pose).all() or abs(pose[3] - last_row).max() > LAST_ROW_TOLERANCE
-            for pose in matrices
-        ],
-        "is not a 4 x 4 matrix of finite numbers with the last row 0 0 0 1. Give the camera-to-world matrix",
-    )
+    fault = "is not a 4 x 4 matrix of finite numbers with the last row 0 0 0 1. Give the camera-to-world matrix"
+    reject([not _is_affine(pose) for pose in matrices], fault)
     poses = np.stack(matrices)
     rotation = poses[:, :3, :3]
     with np.errstate(over="ignore", invalid="ignore"):

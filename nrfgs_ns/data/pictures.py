@@ -36,14 +36,11 @@ Result = TypeVar("Result")
 
 
 @cache
-def reads_heif() -> bool:
-    """Whether PIL reads HEIF, from now on."""
-    try:
-        import pillow_heif
-    except ImportError:
-        return False
+def read_heif() -> None:
+    """Let PIL read HEIF from now on; ImportError without pillow-heif."""
+    import pillow_heif
+
     pillow_heif.register_heif_opener()
-    return True
 
 
 def is_heif(path: Path) -> bool:
@@ -55,9 +52,10 @@ def is_heif(path: Path) -> bool:
 
 def open_picture(path: Path) -> Image.Image:
     """An image whose header alone is read; InputError if it is of no known format."""
-    heif = is_heif(path)
-    if heif and not reads_heif():
-        raise InputError(f"{path} is a HEIC photograph: run `pip install pillow-heif`, or convert it to JPEG.")
+    if heif := is_heif(path):
+        fix = "Run `pip install pillow-heif`, or convert it to JPEG."
+        with refusing(f"{path} is a HEIC photograph", fix, ImportError):
+            read_heif()
     with refusing(f"{path} is not a readable image", RESTORE, Exception):
         return Image.open(path, formats=(*FORMATS, "HEIF") if heif else FORMATS)
 

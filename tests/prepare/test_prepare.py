@@ -261,7 +261,7 @@ def test_a_camera_that_its_matches_contradict_is_left_out(prepared, walls, tmp_p
     (lambda d: None, "no such folder"),
     (lambda d: photo(d / "more" / "a.jpg"), "directly holds 0 photographs"),
     (lambda d: (d.mkdir(), (d / "a.mp4").touch()), "name that file itself"),
-    (lambda d: [photo(d / "a.jpg"), (d / "b.HEIC").touch()], "b.HEIC is .*: run `pip install pillow-heif`"),
+    (lambda d: [photo(d / "a.jpg"), (d / "b.HEIC").touch()], "b.HEIC is .*Run `pip install pillow-heif`"),
     (lambda d: (photo(d / "images" / "a.jpg"), (d / "transforms.json").touch()), "scene already.*ns-train nrfgs"),
     (lambda d: d.write_text("no video"), "neither a folder of photographs nor a video"),
 ])  # fmt: skip
