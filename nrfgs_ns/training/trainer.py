@@ -59,10 +59,6 @@ class NrfgsTrainer(Trainer):
     _stop = False
     _saved_step: int | None = None
 
-    def __init__(self, config: NrfgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
-        self.request = StopRequest()
-        super().__init__(config, local_rank, world_size)
-
     @property
     def stop_training(self) -> bool:
         """Whether no further step is made. Nerfstudio's loop reads and sets it."""
@@ -84,6 +80,7 @@ class NrfgsTrainer(Trainer):
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         end_earlier_logs()
+        self.request = StopRequest()
         try:
             super().setup(test_mode)
         except KeyboardInterrupt:
