@@ -35,6 +35,12 @@ def shown(value: Any) -> str:
     return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]}...{text[-LONGEST // 2 :]}"
 
 
+def require(holds: bool, option: str, value: Any, needed: str) -> None:
+    """Raise InputError naming an option, its value and what is `needed`, unless the condition holds."""
+    if not holds:
+        raise InputError(f"{option} is {value}; it must be {needed}.")
+
+
 @contextlib.contextmanager
 def refusing(finding: str, fix: str, *kinds: type[Exception]) -> Iterator[None]:
     """Turn an exception of these kinds into InputError: the finding, what the exception says, and the fix."""

@@ -22,7 +22,7 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from nrfgs_ns.errors import InputError, refusing
+from nrfgs_ns.errors import InputError, refusing, require
 from nrfgs_ns.files import write_whole
 from nrfgs_prepare import pairs, structure
 from nrfgs_prepare import photos as files
@@ -72,9 +72,8 @@ class Run:
     """One call of the command: its paths, and the state of the stages."""
 
     def __init__(self, options: Prepare, screen: Console | None = None):
-        for name in ("features", "frames"):
-            if getattr(options, name) < 10:
-                raise InputError(f"--{name} is {getattr(options, name)}. Give at least 10.")
+        for name, value in (("--features", options.features), ("--frames", options.frames)):
+            require(value >= 10, name, value, "at least 10")
         self.options, self.screen = options, screen or Console()
         self.inputs = files.find_inputs(options.photos)
         self.is_video = options.photos.is_file()

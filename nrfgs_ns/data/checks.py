@@ -18,7 +18,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from nrfgs_ns.data.pictures import read_size
-from nrfgs_ns.errors import InputError, shown
+from nrfgs_ns.errors import InputError, require, shown
 
 SHOWN = 3
 """Items that a message lists before it counts the rest."""
@@ -83,9 +83,8 @@ def check_options(config: Any) -> None:
     """Check that the parser's numbers are in their ranges."""
     for name, least in (("scale_factor", 0), ("scene_scale", 0), ("downscale_factor", 1), ("eval_interval", 1)):
         value = getattr(config, name)
-        if value is not None and not (0 < value < math.inf and value >= least):
-            fix = "1 or more" if least else "a positive number"
-            raise InputError(f"--{name.replace('_', '-')} is {value}. Give {fix}.")
+        holds = value is None or (0 < value < math.inf and value >= least)
+        require(holds, f"--{name.replace('_', '-')}", value, "1 or more" if least else "positive")
 
 
 def check_frames(frames: list[dict[str, Any]], source: Path) -> None:
@@ -199,8 +198,8 @@ def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -
 def applied_scale(meta: dict[str, Any], source: Path) -> float:
     """The scale that the poses already have."""
     scale = meta.get("applied_scale", 1.0)
-    if not 0 < number(scale) < np.inf:
-        raise InputError(f"{source}: applied_scale is {shown(repr(scale))}. Give a positive number or remove it.")
+    holds = 0 < number(scale) < math.inf
+    require(holds, f"{source}: applied_scale", shown(repr(scale)), "a positive number, or removed")
     return number(scale)
 
 

@@ -34,7 +34,7 @@ from nrfgs_ns.data.dataparser import NrfgsDataParser, NrfgsDataParserConfig
 from nrfgs_ns.data.lenses import LENS, undistorted_cameras
 from nrfgs_ns.data.pictures import cache_folder, in_parallel, read_mask, read_picture
 from nrfgs_ns.data.views import different_views, nearest_depth, scene_unit
-from nrfgs_ns.errors import InputError, refusing
+from nrfgs_ns.errors import InputError, refusing, require
 from nrfgs_ns.files import whole
 
 IMAGES = "image", "mask"
@@ -124,10 +124,9 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
 
     def __init__(self, config: NrfgsDatamanagerConfig, *args: Any, **kwargs: Any):
         config.dataparser = checked(config.dataparser)
-        if not 0 < (scale := config.camera_res_scale_factor) <= 16:
-            raise InputError(f"--pipeline.datamanager.camera-res-scale-factor is {scale}. Give more than 0, up to 16.")
-        if (memory := config.image_memory) is not None and not memory >= 0:
-            raise InputError(f"--pipeline.datamanager.image-memory is {memory}. Give 0 or more gigabytes.")
+        scale, memory = config.camera_res_scale_factor, config.image_memory
+        require(0 < scale <= 16, "--pipeline.datamanager.camera-res-scale-factor", scale, "more than 0, and up to 16")
+        require(memory is None or memory >= 0, "--pipeline.datamanager.image-memory", memory, "0 or more gigabytes")
         self._views: dict[int, Cameras] = {}
         """training cameras by index, kept since moving one to a GPU takes as long as a step"""
         try:
@@ -229,8 +228,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
     def load_sampling_state(self, state: dict[str, Any]) -> None:
         """Continue the order of cameras from `sampling_state()` of the same images (`training/identity.py`)."""
         self.train_unseen_cameras = list(state["unseen_cameras"])
-        version, words, gauss = state["generator"]
-        self.random_generator.setstate((version, tuple(words), gauss))
+        self.random_generator.setstate(state["generator"])
 
 
 def _shows_anything(data: dict[str, Any]) -> bool:

@@ -10,7 +10,7 @@ from nerfstudio.data.utils import dataparsers_utils as nerfstudio_splits
 
 from nrfgs_ns.data.checks import check_unique, some, warn
 from nrfgs_ns.data.views import interior_test_images
-from nrfgs_ns.errors import InputError, refusing
+from nrfgs_ns.errors import InputError, refusing, require
 
 SPLITS = ("train", "val", "test")
 """nerfstudio's names of the parts of a data set."""
@@ -51,8 +51,7 @@ def split_by_rule(config: Any, images: list[Path], source: Path) -> Rows:
     if count == 1:
         train, evaluated = [0], []
     elif mode == "interior":
-        if every < 2:
-            raise InputError(f"--eval-interval is {every}. Give 2 or more, or choose another --eval-mode.")
+        require(every >= 2, "--eval-interval", every, "2 or more with --eval-mode interior")
         evaluated = interior_test_images(count, every)
         train = np.setdiff1d(np.arange(count), evaluated)
     else:

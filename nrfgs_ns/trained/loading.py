@@ -122,7 +122,6 @@ def measure_loss(pipeline, pictures: Callable[[Any], dict[str, Tensor]]) -> dict
     model, data = pipeline.model, pipeline.datamanager
     names = picture_names(data.eval_dataset.image_filenames)
     per_image = []
-    scores = {}
     with progress("Measuring the loss", len(names)) as advance:
         for image, (camera, batch) in zip(names, data.fixed_indices_eval_dataloader, strict=True):
             outputs = model.get_outputs_for_camera(camera)

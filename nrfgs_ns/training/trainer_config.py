@@ -17,7 +17,7 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
-from nrfgs_ns.errors import InputError, refusing, shown
+from nrfgs_ns.errors import InputError, refusing, require, shown
 from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.config_file import check_types
 from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS, Pace, TimedPace, steps_for
@@ -92,9 +92,8 @@ class NrfgsTrainerConfig(TrainerConfig):
                 limits.append((f"{name}.scheduler.lr_final", schedule.lr_final, positive))
                 limits.append((f"{name}.scheduler.max_steps", schedule.max_steps, schedule.warmup_steps + 1))
         for name, value, low in limits:
-            if value is not None and not low <= value < MOST:
-                least = "positive" if low == positive else f"at least {low}"
-                raise InputError(f"{name} is {value}; it must be {least}, and below 2^32.")
+            least = "positive" if low == positive else f"at least {low}"
+            require(value is None or low <= value < MOST, name, value, f"{least}, and below 2^32")
         if devices == 1 and self.machine.device_type == "cuda" and not torch.cuda.is_available():
             raise InputError("machine.device_type is cuda, but PyTorch finds no GPU (`nrfgs doctor`). Give cpu.")
         check_types(self.pipeline, "config.yml", "pipeline.")

@@ -54,7 +54,6 @@ class Between:
     """
 
     def __init__(self, cameras: Cameras):
-        self.cameras = cameras
         self.views = [cameras[index : index + 1] for index in range(len(cameras))]
         self.poses = cameras.camera_to_worlds.double().numpy()
         centers, backward = cameras.camera_to_worlds[..., 3], cameras.camera_to_worlds[..., 2]
