@@ -47,7 +47,7 @@ def refusing(finding: str, fix: str, *kinds: type[Exception]) -> Iterator[None]:
     try:
         yield
     except kinds as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(":.")
         raise InputError(f"{finding} ({shown(reason)}). {fix}") from error
 
 

@@ -57,15 +57,12 @@ class Prepare:
     """frames to take from a video, 10 or more; at most all that it has"""
 
     def main(self) -> None:
-        try:
-            Run(self).all()
-        except OSError as error:
-            raise InputError(f"{error.filename or self.out}: {error.strerror or error}.") from error
-        except RuntimeError as error:  # COLMAP's
-            work = self.out / "work"
-            raise InputError(
-                f"{work}: COLMAP stops with {str(error)!r}. If the disk has room, delete {work} and run this again."
-            ) from error
+        work = self.out / "work"
+        again = f"If the disk has room, delete {work} and run this again."
+        access = "Name files and folders of yours, on a disk with room."
+        with refusing(f"{work}: COLMAP stops with an error", again, RuntimeError):
+            with refusing(f"{self.out} cannot be finished", access, OSError):
+                Run(self).all()
 
 
 class Run:

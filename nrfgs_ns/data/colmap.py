@@ -60,10 +60,8 @@ def _file(folder: Path, stem: str) -> Path:
 
 
 def _read(read: Callable[..., Any], path: Path, *rest: Any) -> Any:
-    try:
+    with refusing(f"{path} cannot be read", EXPORT, Exception):  # whatever damaged bytes lead to
         return read(path, *rest)
-    except Exception as error:  # whatever damaged bytes lead to
-        raise InputError(f"{path} cannot be read ({type(error).__name__}: {shown(str(error))}). {EXPORT}") from error
 
 
 def _lens(camera: Any, path: Path) -> dict[str, Any]:

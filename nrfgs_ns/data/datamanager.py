@@ -129,14 +129,12 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
         require(memory is None or memory >= 0, "--pipeline.datamanager.image-memory", memory, "0 or more gigabytes")
         self._views: dict[int, Cameras] = {}
         """training cameras by index, kept since moving one to a GPU takes as long as a step"""
-        try:
+        kinds: tuple[type[Exception], ...] = (OSError,)
+        if not issubclass(config.dataparser._target, NrfgsDataParser):  # nerfstudio's raise others for a user's mistake
+            kinds += LookupError, AttributeError, AssertionError, TypeError, ValueError
+        fix = "Check the path in --data or config.yml, and what kind of data set it is."
+        with refusing(f"{config.data or config.dataparser.data} cannot be read", fix, *kinds):
             super().__init__(config, *args, **kwargs)
-        except (OSError, LookupError, AttributeError, AssertionError, TypeError, ValueError) as error:
-            if not isinstance(error, OSError) and issubclass(config.dataparser._target, NrfgsDataParser):
-                raise  # only nerfstudio's own parsers raise these for a user's mistake
-            finding = f"cannot be read ({type(error).__name__}: {' '.join(str(error).split())})"
-            fix = "Check the path in --data or config.yml, and what kind of data set it is."
-            raise InputError(f"{config.data or config.dataparser.data} {finding}. {fix}") from error
 
     @property
     def evaluated_split(self) -> Literal["test", "training"]:

@@ -295,7 +295,7 @@ def test_what_is_refused_before_any_work(three, tmp_path, monkeypatch):
         Run(Prepare(three, tmp_path / "mine"))
     with pytest.raises(InputError, match="--features is 1"):
         Run(Prepare(three, tmp_path / "out", features=1))
-    with pytest.raises(InputError, match="precious.txt/out.*: Not a directory"):
+    with pytest.raises(InputError, match="precious.txt/out cannot be finished .*Not a directory"):
         Prepare(three, tmp_path / "mine" / "precious.txt" / "out").main()
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(InputError, match="pip install pycolmap"):
