@@ -92,10 +92,15 @@ def stored_names(photos: list[Path]) -> list[str]:
     return list(names)
 
 
-def import_photos(photos: list[Path], folder: Path, advance: Advance) -> None:
-    """Copy photographs into a folder, turned upright by EXIF; InputError names a file that cannot be decoded."""
+def make_empty(folder: Path) -> None:
+    """Make a folder, without what was in it."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
+
+
+def import_photos(photos: list[Path], folder: Path, advance: Advance) -> None:
+    """Copy photographs into a folder, turned upright by EXIF; InputError names a file that cannot be decoded."""
+    make_empty(folder)
     for path, name in zip(photos, stored_names(photos), strict=True):
         with open_picture(path) as image:
             _store(image, path, folder / name)
@@ -149,8 +154,7 @@ def import_video(video: Path, folder: Path, frames: int, advance: Advance) -> No
     total = int(reader.get(cv2.CAP_PROP_FRAME_COUNT))
     frames = min(frames, total)
     written = 0
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
+    make_empty(folder)
 
     def decoded() -> Iterator[tuple[int, np.ndarray]]:
         for index in range(total):

@@ -29,7 +29,7 @@ from nrfgs_ns.data.lenses import check_distortions
 from nrfgs_ns.data.pictures import known_exif, read_size
 from nrfgs_ns.data.points import check_sight, finite, in_reach, read_ply
 from nrfgs_ns.data.splits import SPLITS, STAND_INS, Named, Rows, split_by_names, split_by_rule
-from nrfgs_ns.errors import InputError, refusing, shown
+from nrfgs_ns.errors import InputError, refusing, require, shown
 from nrfgs_ns.start import with_data_parsers
 
 with_data_parsers()
@@ -165,9 +165,8 @@ class NrfgsDataParser(DataParser):
         scaled = config.auto_scale_poses and len(frames) > 1
         poses = checks.check_poses(frames, source, need_spread=scaled)
         orientation = meta.get("orientation_override", config.orientation_method)
-        if orientation not in ORIENTATIONS:
-            fix = f"Use one of {', '.join(ORIENTATIONS)}, or remove it."
-            raise InputError(f"{source}: orientation_override is {shown(repr(orientation))}. {fix}")
+        needed = f"one of {', '.join(ORIENTATIONS)}, or removed"
+        require(orientation in ORIENTATIONS, f"{source}: orientation_override", shown(repr(orientation)), needed)
         placed, transform, scale = place(poses, orientation, config.center_method, scaled, config.scale_factor)
         kind = CAMERA_MODEL_TO_TYPE[meta.get("camera_model", "OPENCV")]
         if kind == CameraType.FISHEYE:

@@ -120,9 +120,8 @@ def in_parallel(
     with ThreadPoolExecutor(max(int(workers), 1)) as pool:
         try:
             yield from track(pool.map(read, range(len(sizes))), what, len(sizes), console=CONSOLE, transient=True)
-        except BaseException:
+        finally:
             pool.shutdown(cancel_futures=True)
-            raise
 
 
 def cache_folder() -> Path:

@@ -74,9 +74,8 @@ class NrfgsTrainerConfig(TrainerConfig):
             fix = "Leave it out, or make them transparent and choose --pipeline.model.background-color."
             name = "pipeline.datamanager.dataparser.mask_color"
             raise InputError(f"{name} is {color}; masked pixels are not trained on, whatever their colour. {fix}")
-        if (order := data.train_cameras_sampling_strategy) != "random":
-            name = "pipeline.datamanager.train_cameras_sampling_strategy"
-            raise InputError(f"{name} is {order}; these methods draw cameras at random. Leave it out.")
+        order = data.train_cameras_sampling_strategy
+        require(order == "random", "pipeline.datamanager.train_cameras_sampling_strategy", order, "random")
         lowest = {
             positive: ("time_budget", "schedule_steps", "pipeline.datamanager.camera_res_scale_factor"),
             0: ("max_num_iterations", "average_steps", "pipeline.datamanager.max_thread_workers", "machine.seed"),

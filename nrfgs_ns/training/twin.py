@@ -172,8 +172,7 @@ def pull(training, view: Cameras, seen: Tensor, step: int) -> Gradients:
 
 def picture(training, view: Cameras, step: int) -> Tensor:
     """A model's picture of a view (`NrfgsModel.picture`), recorded where steps are."""
-    recorded = training.graphs.picture(view, step)
-    if recorded is not None:
+    if (recorded := training.graphs.picture(view, step)) is not None:
         return recorded
     model = training.pipeline.model
     with torch.no_grad():
