@@ -108,8 +108,7 @@ def read_lenses(meta: dict[str, Any], source: Path) -> np.ndarray:
     _check_model(meta, source)
     shared = {key: meta[key] for key in (*PIXELS, *DISTORTION, "distortion_params") if key in meta}
     for key, value in shared.items():
-        other = [frame["file_path"] for frame in meta["frames"] if key in frame and frame[key] != value]
-        if other:
+        if other := [frame["file_path"] for frame in meta["frames"] if key in frame and frame[key] != value]:
             finding = f"{source}: {key} of {some(other)} is not the one at the top level, which holds for all frames"
             raise InputError(f"{finding}. Remove one of them.")
     return np.array([_lens({**frame, **shared}, source) for frame in meta["frames"]])
@@ -213,8 +212,7 @@ def applied_transform(meta: dict[str, Any], source: Path) -> Tensor:
 
 def check_unique(names: Iterable[Any], where: str) -> None:
     """Check that no name occurs twice; `where` begins the message."""
-    twice = [name for name, count in Counter(names).items() if count > 1]
-    if twice:
+    if twice := [name for name, count in Counter(names).items() if count > 1]:
         raise InputError(f"{where} name {some(twice)} more than once. Keep one of each.")
 
 

@@ -37,8 +37,7 @@ def allow_nerfstudio_checkpoints() -> None:
 
 def find(folder: Path) -> dict[int, Path]:
     """Checkpoints in a folder by step, the newest first; empty if there is no folder."""
-    files = folder.iterdir() if folder.is_dir() else ()
-    by_step = {int(match[1]): file for file in files if (match := NAME.fullmatch(file.name))}
+    by_step = {int(match[1]): file for file in folder.glob("*") if (match := NAME.fullmatch(file.name))}
     return dict(sorted(by_step.items(), reverse=True))
 
 
