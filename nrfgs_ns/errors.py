@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Exceptions meant for the user rather than for the programmer."""
 
+import contextlib
 import os
 import sys
+from collections.abc import Iterator
+from typing import Any
 
 DEBUG = os.environ.get("NRFGS_DEBUG", "0") not in ("", "0")
 """NRFGS_DEBUG=1: such exceptions show their traceback."""
+LONGEST = 160
+"""Characters of a value in a message."""
 
 
 class ForTheUser(Exception if DEBUG else SystemExit):
@@ -22,6 +27,28 @@ class InputError(ForTheUser, ValueError):
     The message has three parts: the file or field, what was found there, and what the user can do next. It is raised
     before time is spent on training.
     """
+
+
+def shown(value: Any) -> str:
+    """A value from a file for a message: one printable line of bounded length."""
+    text = value if isinstance(value, str) and value.isprintable() else ascii(value)
+    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]}...{text[-LONGEST // 2 :]}"
+
+
+def require(holds: bool, option: str, value: Any, needed: str) -> None:
+    """Raise InputError naming an option, its value and what is `needed`, unless the condition holds."""
+    if not holds:
+        raise InputError(f"{option} is {value}; it must be {needed}.")
+
+
+@contextlib.contextmanager
+def refusing(finding: str, fix: str, *kinds: type[Exception]) -> Iterator[None]:
+    """Turn an exception of these kinds into InputError: the finding, what the exception says, and the fix."""
+    try:
+        yield
+    except kinds as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(":.")
+        raise InputError(f"{finding} ({shown(reason)}). {fix}") from error
 
 
 def mind_the_reader() -> None:

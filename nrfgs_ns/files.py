@@ -8,19 +8,17 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import InputError, refusing
 
 
 def check_writable(path: Path, option: str) -> None:
     """Raise InputError, before a command's work, where a file cannot be written. `option` named the file."""
-    try:
+    with refusing(f"{option} {path} cannot be written", "Name a file in a folder of yours.", OSError):
         if path.exists() and not path.is_file():  # a device would be replaced
             raise InputError(f"{option} {path} is a folder or a device. Name a file.")
         folder = next(folder for folder in path.parents if folder.exists())
         with tempfile.NamedTemporaryFile(dir=folder, prefix=f"{path.name}.", suffix=".writing"):
             pass
-    except OSError as error:
-        raise InputError(f"{option} {path} cannot be written ({error}). Name a file in a folder of yours.") from error
 
 
 def write_whole(path: Path, content: str | bytes) -> None:

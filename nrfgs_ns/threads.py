@@ -11,29 +11,18 @@ SMALL = 100_000
 """Splats plus pixels of a picture below which one thread is enough."""
 
 
-class Threads:
-    """Torch's thread count within `few_threads`."""
-
-    def __init__(self, most: int):
-        self.most = most
-
-    def suit(self, splats: int, pixels: int = 0) -> None:
-        """Use all threads for pictures of this size, unless it is small."""
-        if splats + pixels >= SMALL:
-            torch.set_num_threads(self.most)
-
-    def suit_to(self, pipeline) -> None:
-        """`suit` for a pipeline's pictures."""
-        cameras = pipeline.datamanager.train_dataset.cameras
-        self.suit(pipeline.model.num_points, int((cameras.width * cameras.height).max()) if len(cameras) else 0)
-
-
 @contextlib.contextmanager
-def few_threads() -> Iterator[Threads]:
-    """Compute with one CPU thread until the block ends, or until `suit` finds large work in it."""
+def few_threads(are_enough: bool = True) -> Iterator[None]:
+    """Compute with one CPU thread until the block ends, if that is enough."""
     most = torch.get_num_threads()
-    torch.set_num_threads(1)
+    torch.set_num_threads(1 if are_enough else most)
     try:
-        yield Threads(most)
+        yield
     finally:
         torch.set_num_threads(most)
+
+
+def draws_small(pipeline) -> bool:
+    """Whether one thread is enough for a pipeline's pictures."""
+    cameras = pipeline.datamanager.train_dataset.cameras
+    return pipeline.model.num_points + int((cameras.width * cameras.height).max()) < SMALL

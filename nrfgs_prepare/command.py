@@ -22,7 +22,7 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import InputError, refusing, require
 from nrfgs_ns.files import write_whole
 from nrfgs_prepare import pairs, structure
 from nrfgs_prepare import photos as files
@@ -57,24 +57,20 @@ class Prepare:
     """frames to take from a video, 10 or more; at most all that it has"""
 
     def main(self) -> None:
-        try:
-            Run(self).all()
-        except OSError as error:
-            raise InputError(f"{error.filename or self.out}: {error.strerror or error}.") from error
-        except RuntimeError as error:  # COLMAP's
-            work = self.out / "work"
-            raise InputError(
-                f"{work}: COLMAP stops with {str(error)!r}. If the disk has room, delete {work} and run this again."
-            ) from error
+        work = self.out / "work"
+        again = f"If the disk has room, delete {work} and run this again."
+        access = "Name files and folders of yours, on a disk with room."
+        with refusing(f"{work}: COLMAP stops with an error", again, RuntimeError):
+            with refusing(f"{self.out} cannot be finished", access, OSError):
+                Run(self).all()
 
 
 class Run:
     """One call of the command: its paths, and the state of the stages."""
 
     def __init__(self, options: Prepare, screen: Console | None = None):
-        for name in ("features", "frames"):
-            if getattr(options, name) < 10:
-                raise InputError(f"--{name} is {getattr(options, name)}. Give at least 10.")
+        for name, value in (("--features", options.features), ("--frames", options.frames)):
+            require(value >= 10, name, value, "at least 10")
         self.options, self.screen = options, screen or Console()
         self.inputs = files.find_inputs(options.photos)
         self.is_video = options.photos.is_file()
@@ -86,10 +82,8 @@ class Run:
         self.source = str(options.photos.resolve())
         if self.out.exists() and not file.is_file() and (self.out.is_file() or any(self.out.iterdir())):
             raise InputError(f"{self.out} exists and was not made by `nrfgs prepare`. Name a new or an empty folder.")
-        try:
+        with refusing(f"{file} is damaged", f"Delete {self.out} and begin again.", ValueError, TypeError):
             self.state: dict[str, Any] = dict(json.loads(file.read_text())) if file.is_file() else {}
-        except (ValueError, TypeError) as error:
-            raise InputError(f"{file} is damaged ({error}). Delete {self.out} and begin again.") from error
         self.key = self.digest = files.digest(self.inputs)
         if self.state.get("digest", self.digest) != self.digest and (other := self.state.get("source")) != self.source:
             fix = "Name another folder, or delete this one."

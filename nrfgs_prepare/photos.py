@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
-from nrfgs_ns.data.pictures import NUMBERS, check_depth, exif_of, is_heif, naming, open_picture, read_exif, read_size
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.data.pictures import NUMBERS, RESTORE, check_depth, exif_of, is_heif, open_picture, read_exif, read_size
+from nrfgs_ns.errors import InputError, refusing
 from nrfgs_prepare.pairs import Advance
 
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif")
@@ -92,10 +92,15 @@ def stored_names(photos: list[Path]) -> list[str]:
     return list(names)
 
 
-def import_photos(photos: list[Path], folder: Path, advance: Advance) -> None:
-    """Copy photographs into a folder, turned upright by EXIF; InputError names a file that cannot be decoded."""
+def make_empty(folder: Path) -> None:
+    """Make a folder, without what was in it."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
+
+
+def import_photos(photos: list[Path], folder: Path, advance: Advance) -> None:
+    """Copy photographs into a folder, turned upright by EXIF; InputError names a file that cannot be decoded."""
+    make_empty(folder)
     for path, name in zip(photos, stored_names(photos), strict=True):
         with open_picture(path) as image:
             _store(image, path, folder / name)
@@ -107,7 +112,7 @@ def _store(image: Image.Image, path: Path, target: Path) -> None:
     check_depth(image, path)
     if min(image.size) < SMALLEST:
         raise InputError(f"{path} is {image.width} x {image.height} pixels, too small to show anything. Remove it.")
-    with naming(path, "cannot be decoded"):
+    with refusing(f"{path} cannot be decoded", RESTORE, Exception):
         image.load()
     exif = exif_of(image)
     upright = exif.get(ExifTags.Base.Orientation, 1) == 1
@@ -149,8 +154,7 @@ def import_video(video: Path, folder: Path, frames: int, advance: Advance) -> No
     total = int(reader.get(cv2.CAP_PROP_FRAME_COUNT))
     frames = min(frames, total)
     written = 0
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
+    make_empty(folder)
 
     def decoded() -> Iterator[tuple[int, np.ndarray]]:
         for index in range(total):

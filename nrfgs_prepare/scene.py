@@ -8,7 +8,6 @@
 
 import json
 import os
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from nrfgs_ns.data.pictures import read_exif, read_picture
 from nrfgs_ns.data.views import interior_test_images
 from nrfgs_ns.files import write_whole
 from nrfgs_prepare.pairs import Advance
+from nrfgs_prepare.photos import make_empty
 from nrfgs_prepare.structure import colmap
 
 DOWNSCALES = (2, 4, 8)
@@ -27,14 +27,12 @@ DOWNSCALES = (2, 4, 8)
 
 def write_scene(distorted: Path, photos: Path, undistorted: Path, out: Path, advance: Advance) -> None:
     """Undistort the photographs of a COLMAP model, and write a scene from them, with the EXIF of `photos`."""
-    shutil.rmtree(undistorted, ignore_errors=True)
-    undistorted.mkdir(parents=True)
+    make_empty(undistorted)
     colmap().undistort_images(undistorted, distorted, photos, output_type="COLMAP", jpeg_quality=97)
     model = colmap().Reconstruction(undistorted / "sparse")
     images = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
     for folder in ("images", *(f"images_{factor}" for factor in DOWNSCALES)):
-        shutil.rmtree(out / folder, ignore_errors=True)
-        (out / folder).mkdir(parents=True)
+        make_empty(out / folder)
     for image in images:
         picture = read_picture(undistorted / "images" / image.name)
         for factor in DOWNSCALES:

@@ -18,7 +18,7 @@ import numpy as np
 from PIL import ExifTags
 
 from nrfgs_ns.data.pictures import exif_of, open_picture, read_size, tag_number
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import InputError, refusing
 from nrfgs_prepare.pairs import Advance, Pairs
 
 Say = Callable[[str], None]
@@ -52,12 +52,9 @@ LONGEST_SIDE = 1600
 
 def colmap():
     """The module pycolmap, silenced; InputError if it is not installed."""
-    try:
+    finding = "`nrfgs prepare` needs pycolmap, which cannot be imported"
+    with refusing(finding, "Run `pip install pycolmap`.", ImportError):
         import pycolmap
-    except ImportError as error:
-        raise InputError(
-            f"`nrfgs prepare` needs pycolmap, which cannot be imported ({error}). Run `pip install pycolmap`."
-        ) from error
     pycolmap.logging.minloglevel = 3
     pycolmap.set_random_seed(SEED)
     return pycolmap

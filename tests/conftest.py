@@ -111,12 +111,10 @@ def any_share():
 @pytest.fixture
 def no_heif(monkeypatch):
     """Hide pillow-heif."""
-    from nrfgs_ns.data.pictures import reads_heif
+    from nrfgs_ns.data.pictures import read_heif
 
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
-    reads_heif.cache_clear()
-    yield
-    reads_heif.cache_clear()
+    read_heif.cache_clear()  # a failure is not kept
 
 
 @pytest.fixture

@@ -18,10 +18,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from nrfgs_ns.data.pictures import read_size
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import InputError, require, shown
 
-SHOWN, LONGEST = 3, 160
-"""Items that a message lists before it counts the rest, and characters of each."""
+SHOWN = 3
+"""Items that a message lists before it counts the rest."""
 PIXELS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 """nerfstudio's order of the parameters."""
@@ -55,12 +55,6 @@ def some(items: Sequence[Any]) -> str:
     return ", ".join(shown(str(item)) for item in items[:SHOWN]) + rest
 
 
-def shown(value: Any) -> str:
-    """A value from a file for a message: one printable line of bounded length."""
-    text = value if isinstance(value, str) and value.isprintable() else ascii(value)
-    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]}...{text[-LONGEST // 2 :]}"
-
-
 def number(value: Any) -> float:
     """The value as a float; NaN if it is not a number."""
     try:
@@ -89,9 +83,8 @@ def check_options(config: Any) -> None:
     """Check that the parser's numbers are in their ranges."""
     for name, least in (("scale_factor", 0), ("scene_scale", 0), ("downscale_factor", 1), ("eval_interval", 1)):
         value = getattr(config, name)
-        if value is not None and not (0 < value < math.inf and value >= least):
-            fix = "1 or more" if least else "a positive number"
-            raise InputError(f"--{name.replace('_', '-')} is {value}. Give {fix}.")
+        holds = value is None or (0 < value < math.inf and value >= least)
+        require(holds, f"--{name.replace('_', '-')}", value, "1 or more" if least else "positive")
 
 
 def check_frames(frames: list[dict[str, Any]], source: Path) -> None:
@@ -115,8 +108,7 @@ def read_lenses(meta: dict[str, Any], source: Path) -> np.ndarray:
     _check_model(meta, source)
     shared = {key: meta[key] for key in (*PIXELS, *DISTORTION, "distortion_params") if key in meta}
     for key, value in shared.items():
-        other = [frame["file_path"] for frame in meta["frames"] if key in frame and frame[key] != value]
-        if other:
+        if other := [frame["file_path"] for frame in meta["frames"] if key in frame and frame[key] != value]:
             finding = f"{source}: {key} of {some(other)} is not the one at the top level, which holds for all frames"
             raise InputError(f"{finding}. Remove one of them.")
     return np.array([_lens({**frame, **shared}, source) for frame in meta["frames"]])
@@ -162,6 +154,12 @@ def _check_model(meta: dict[str, Any], source: Path) -> None:
                 )
 
 
+def _is_affine(pose: np.ndarray) -> bool:
+    """Whether an array is a 4 x 4 matrix of finite numbers with the last row 0 0 0 1."""
+    finite = pose.shape == (4, 4) and np.isfinite(pose).all()
+    return finite and np.allclose(pose[3], (0, 0, 0, 1), rtol=0, atol=LAST_ROW_TOLERANCE)
+
+
 def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -> np.ndarray:
     """Rigid camera-to-world matrices, float64 [V, 4, 4]; with `need_spread`, not all at one place."""
     names = np.array([frame["file_path"] for frame in frames])
@@ -172,14 +170,8 @@ def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -
             where = some(names[np.flatnonzero(bad)])
             raise InputError(f"{source}: transform_matrix of {where} {finding}, or remove the frame.")
 
-    last_row = (0, 0, 0, 1)
-    reject(
-        [
-            pose.shape != (4, 4) or not np.isfinite(pose).all() or abs(pose[3] - last_row).max() > LAST_ROW_TOLERANCE
-            for pose in matrices
-        ],
-        "is not a 4 x 4 matrix of finite numbers with the last row 0 0 0 1. Give the camera-to-world matrix",
-    )
+    fault = "is not a 4 x 4 matrix of finite numbers with the last row 0 0 0 1. Give the camera-to-world matrix"
+    reject([not _is_affine(pose) for pose in matrices], fault)
     poses = np.stack(matrices)
     rotation = poses[:, :3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
@@ -205,8 +197,8 @@ def check_poses(frames: list[dict[str, Any]], source: Path, need_spread: bool) -
 def applied_scale(meta: dict[str, Any], source: Path) -> float:
     """The scale that the poses already have."""
     scale = meta.get("applied_scale", 1.0)
-    if not 0 < number(scale) < np.inf:
-        raise InputError(f"{source}: applied_scale is {shown(repr(scale))}. Give a positive number or remove it.")
+    holds = 0 < number(scale) < math.inf
+    require(holds, f"{source}: applied_scale", shown(repr(scale)), "a positive number, or removed")
     return number(scale)
 
 
@@ -220,8 +212,7 @@ def applied_transform(meta: dict[str, Any], source: Path) -> Tensor:
 
 def check_unique(names: Iterable[Any], where: str) -> None:
     """Check that no name occurs twice; `where` begins the message."""
-    twice = [name for name, count in Counter(names).items() if count > 1]
-    if twice:
+    if twice := [name for name, count in Counter(names).items() if count > 1]:
         raise InputError(f"{where} name {some(twice)} more than once. Keep one of each.")
 
 

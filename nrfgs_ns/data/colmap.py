@@ -16,8 +16,8 @@ import numpy as np
 from nerfstudio.data.utils import colmap_parsing_utils as nerfstudio_colmap
 from nerfstudio.process_data.colmap_utils import parse_colmap_camera_params
 
-from nrfgs_ns.data.checks import find_colmap, shown
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.data.checks import find_colmap
+from nrfgs_ns.errors import InputError, refusing, shown
 
 QUATERNION_TOLERANCE = 1e-2
 """Largest difference of a rotation quaternion's length from 1."""
@@ -60,20 +60,15 @@ def _file(folder: Path, stem: str) -> Path:
 
 
 def _read(read: Callable[..., Any], path: Path, *rest: Any) -> Any:
-    try:
+    with refusing(f"{path} cannot be read", EXPORT, Exception):  # whatever damaged bytes lead to
         return read(path, *rest)
-    except Exception as error:  # whatever damaged bytes lead to
-        raise InputError(f"{path} cannot be read ({type(error).__name__}: {shown(str(error))}). {EXPORT}") from error
 
 
 def _lens(camera: Any, path: Path) -> dict[str, Any]:
-    try:
+    finding = f"{path}: a camera of model {shown(camera.model)} with {len(camera.params)} parameters is not supported"
+    fix = "Undistort the photographs (colmap image_undistorter), or use OPENCV or OPENCV_FISHEYE."
+    with refusing(finding, fix, NotImplementedError, IndexError, ValueError):
         return parse_colmap_camera_params(camera)
-    except (NotImplementedError, IndexError, ValueError) as error:
-        raise InputError(
-            f"{path}: a camera of model {shown(camera.model)} with {len(camera.params)} parameters is not supported. "
-            "Undistort the photographs (colmap image_undistorter), or use OPENCV or OPENCV_FISHEYE."
-        ) from error
 
 
 def _frame(id: int, pose: Sequence[float], camera: int, name: str) -> dict[str, Any]:

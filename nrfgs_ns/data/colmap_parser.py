@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """nerfstudio's `colmap` parser with the checks of `nrfgs-data`, and the parsers in place of nerfstudio's."""
 
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,11 +10,11 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
-from nrfgs_ns.data.checks import check_frames, shown
+from nrfgs_ns.data.checks import check_frames
 from nrfgs_ns.data.colmap import read_frames
 from nrfgs_ns.data.dataparser import NrfgsDataParser
 from nrfgs_ns.data.splits import Named
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import InputError, refusing
 
 UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """nerfstudio's turn of COLMAP's world, whose y points downwards, to one whose z points upwards."""
@@ -32,8 +31,6 @@ class NrfgsColmapDataParser(NrfgsDataParser):
 
     def _read(self) -> tuple[dict[str, Any], Path]:
         config = self.config
-        if not os.path.exists(config.data):
-            raise InputError(f"{shown(str(config.data))}: no such folder. Check the path in --data or config.yml.")
         frames, source = read_frames(self._colmap)
         kinds = {frame["camera_model"] for frame in frames}
         if len(kinds) > 1:
@@ -62,10 +59,8 @@ class NrfgsColmapDataParser(NrfgsDataParser):
         for split, file in LISTS:
             path = self._folder / f"{file}_list.txt"
             if path.is_file():
-                try:
+                with refusing(f"{path} cannot be read", "Write one image name on each line.", OSError, ValueError):
                     lines = path.read_text(encoding="utf-8").splitlines()
-                except (OSError, ValueError) as error:
-                    raise InputError(f"{path} cannot be read ({error}). Write one image name on each line.") from error
                 named[split] = path.name, [line.strip() for line in lines if line.strip()]
         return named
 

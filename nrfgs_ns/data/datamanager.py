@@ -34,7 +34,7 @@ from nrfgs_ns.data.dataparser import NrfgsDataParser, NrfgsDataParserConfig
 from nrfgs_ns.data.lenses import LENS, undistorted_cameras
 from nrfgs_ns.data.pictures import cache_folder, in_parallel, read_mask, read_picture
 from nrfgs_ns.data.views import different_views, nearest_depth, scene_unit
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import InputError, refusing, require
 from nrfgs_ns.files import whole
 
 IMAGES = "image", "mask"
@@ -124,20 +124,17 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
 
     def __init__(self, config: NrfgsDatamanagerConfig, *args: Any, **kwargs: Any):
         config.dataparser = checked(config.dataparser)
-        if not 0 < (scale := config.camera_res_scale_factor) <= 16:
-            raise InputError(f"--pipeline.datamanager.camera-res-scale-factor is {scale}. Give more than 0, up to 16.")
-        if (memory := config.image_memory) is not None and not memory >= 0:
-            raise InputError(f"--pipeline.datamanager.image-memory is {memory}. Give 0 or more gigabytes.")
+        scale, memory = config.camera_res_scale_factor, config.image_memory
+        require(0 < scale <= 16, "--pipeline.datamanager.camera-res-scale-factor", scale, "more than 0, and up to 16")
+        require(memory is None or memory >= 0, "--pipeline.datamanager.image-memory", memory, "0 or more gigabytes")
         self._views: dict[int, Cameras] = {}
         """training cameras by index, kept since moving one to a GPU takes as long as a step"""
-        try:
+        kinds: tuple[type[Exception], ...] = (OSError,)
+        if not issubclass(config.dataparser._target, NrfgsDataParser):  # nerfstudio's raise others for a user's mistake
+            kinds += LookupError, AttributeError, AssertionError, TypeError, ValueError
+        fix = "Check the path in --data or config.yml, and what kind of data set it is."
+        with refusing(f"{config.data or config.dataparser.data} cannot be read", fix, *kinds):
             super().__init__(config, *args, **kwargs)
-        except (OSError, LookupError, AttributeError, AssertionError, TypeError, ValueError) as error:
-            if not isinstance(error, OSError) and issubclass(config.dataparser._target, NrfgsDataParser):
-                raise  # only nerfstudio's own parsers raise these for a user's mistake
-            finding = f"cannot be read ({type(error).__name__}: {' '.join(str(error).split())})"
-            fix = "Check the path in --data or config.yml, and what kind of data set it is."
-            raise InputError(f"{config.data or config.dataparser.data} {finding}. {fix}") from error
 
     @property
     def evaluated_split(self) -> Literal["test", "training"]:
@@ -161,22 +158,19 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
 
     def train_view(self, index: int) -> tuple[Cameras, dict[str, Any]]:
         """A training camera, [1] on the device with "cam_idx" in its metadata, and its photograph by `get_data`."""
-        return self._view(index), self._image(index)
+        batch = self.cached_train[index]
+        return self._view(index), batch | {"image": batch["image"].to(self.device)}
 
     def next_train_views(self, count: int, own: int) -> tuple[list[Cameras], dict[str, Any]]:
         """The next `count` training cameras in turn, [1] each, and the photograph of the one at position `own`."""
         indices = [self._next_index() for _ in range(count)]
-        return [self._view(index) for index in indices], self._image(indices[own])
+        return [self._view(index) for index in indices], self.train_view(indices[own])[1]
 
     def _next_index(self) -> int:
         index = self.train_unseen_cameras.pop(0)
         if len(self.train_unseen_cameras) == 0:
             self.train_unseen_cameras = self.sample_train_cameras()
         return index
-
-    def _image(self, index: int) -> dict[str, Any]:
-        batch = self.cached_train[index]
-        return batch | {"image": batch["image"].to(self.device)}
 
     def _view(self, index: int) -> Cameras:
         if index not in self._views:
@@ -232,8 +226,7 @@ class NrfgsDatamanager(FullImageDatamanager[NrfgsInputDataset]):
     def load_sampling_state(self, state: dict[str, Any]) -> None:
         """Continue the order of cameras from `sampling_state()` of the same images (`training/identity.py`)."""
         self.train_unseen_cameras = list(state["unseen_cameras"])
-        version, words, gauss = state["generator"]
-        self.random_generator.setstate((version, tuple(words), gauss))
+        self.random_generator.setstate(state["generator"])
 
 
 def _shows_anything(data: dict[str, Any]) -> bool:
@@ -255,14 +248,11 @@ def from_cache(dataset: Any, index: int, image_type: str) -> dict[str, Any]:
     except Exception:  # missing, or cut, as cleaners of caches leave them
         data = dataset.get_data(index, image_type)
         content = {name: data[name].contiguous() for name in IMAGES if name in data}
-        try:
-            with whole(path) as unfinished:
-                torch.save(content, unfinished)
-        except (OSError, RuntimeError) as error:  # torch raises RuntimeError where the disk is full
-            fix = "Make room, set XDG_CACHE_HOME to another folder, or give more --pipeline.datamanager.image-memory."
-            raise InputError(f"{path} cannot be written ({error}). {fix}") from error
+        fix = "Make room, set XDG_CACHE_HOME to another folder, or give more --pipeline.datamanager.image-memory."
+        with refusing(f"{path} cannot be written", fix, OSError, RuntimeError), whole(path) as unfinished:
+            torch.save(content, unfinished)  # raises RuntimeError where the disk is full
         content = torch.load(path, mmap=True, weights_only=True)
-    return {"image_idx": index} | {name: content[name] for name in IMAGES if name in content}
+    return {"image_idx": index} | content
 
 
 def _cache_file(dataset: Any, index: int, image_type: str) -> Path:

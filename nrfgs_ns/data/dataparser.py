@@ -15,24 +15,21 @@ import numpy as np
 import torch
 from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
 from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, Cameras, CameraType
-from nerfstudio.data.dataparsers.base_dataparser import (
-    DataParser,
-    DataparserOutputs,
-    transform_poses_to_original_space,
-)
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import MAX_AUTO_RESOLUTION, NerfstudioDataParserConfig
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from nerfstudio.utils.poses import to4x4
 from torch import Tensor
 
 from nrfgs_ns.data import checks
-from nrfgs_ns.data.checks import PIXELS, SMALLEST, find_colmap, shown, warn
+from nrfgs_ns.data.checks import PIXELS, SMALLEST, find_colmap, warn
 from nrfgs_ns.data.colmap import read_points
 from nrfgs_ns.data.lenses import check_distortions
 from nrfgs_ns.data.pictures import known_exif, read_size
 from nrfgs_ns.data.points import check_sight, finite, in_reach, read_ply
 from nrfgs_ns.data.splits import SPLITS, STAND_INS, Named, Rows, split_by_names, split_by_rule
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import InputError, refusing, require, shown
 from nrfgs_ns.start import with_data_parsers
 
 with_data_parsers()
@@ -90,10 +87,7 @@ class PlacedOutputs(DataparserOutputs):
     """nerfstudio's outputs, whose way back may be in float64."""
 
     def transform_poses_to_original_space(self, poses: Tensor, camera_convention="opencv") -> Tensor:
-        way_back = self.dataparser_transform
-        return transform_poses_to_original_space(
-            poses.to(way_back.dtype), way_back, self.dataparser_scale, camera_convention=camera_convention
-        )
+        return super().transform_poses_to_original_space(poses.to(self.dataparser_transform.dtype), camera_convention)
 
 
 class NrfgsDataParser(DataParser):
@@ -141,24 +135,26 @@ class NrfgsDataParser(DataParser):
         """The whole data set, checked as far as can be done without decoding images."""
         config = self.config
         checks.check_options(config)
+        if not os.path.exists(config.data):
+            place = shown(str(config.data))
+            raise InputError(f"{place}: no such file or folder. Check the path in --data or config.yml.")
         meta, source = self._read()
         cameras, transform, scale = self._placed_cameras(meta, source)
         factor = self._factor(meta["frames"], source) if self.downscale_factor is None else self.downscale_factor
         splits = self._splits(meta, source)
-        full_sizes = torch.cat([cameras.width, cameras.height], dim=1).tolist()
+        full_sizes = torch.cat([cameras.width, cameras.height], dim=1)
         rounding = getattr(config, "downscale_rounding_mode", "floor")
         cameras.rescale_output_resolution(scaling_factor=1.0 / factor, scale_rounding_mode=rounding)
-        if (side := int(min(cameras.width.min(), cameras.height.min()))) < SMALLEST:
+        sizes = torch.cat([cameras.width, cameras.height], dim=1)
+        if (side := int(sizes.min())) < SMALLEST:
             raise InputError(f"{source}: --downscale-factor {factor} leaves {side} pixels a side. Give a smaller one.")
         if self.downscale_factor is None:
-            sizes = torch.cat([cameras.width, cameras.height], dim=1).tolist()
-            self._check_sizes(meta["frames"], source, factor, full_sizes, sizes)
-        to_frames = COLMAP_TO_FRAMES if self._colmap.exists() else None
-        if "applied_transform" in meta:
-            to_frames = checks.applied_transform(meta, source)
+            self._check_sizes(meta, source, factor, full_sizes, sizes)
         whole = transform
-        if to_frames is not None:
-            whole = transform @ torch.cat([to_frames.to(transform), torch.tensor([[0, 0, 0, 1]]).to(transform)], 0)
+        if "applied_transform" in meta:
+            whole = transform @ to4x4(checks.applied_transform(meta, source).to(transform))
+        elif self._colmap.exists():
+            whole = transform @ to4x4(COLMAP_TO_FRAMES.to(transform))
         return DataSet(meta, source, splits, factor, cameras, transform, whole, scale)
 
     def _placed_cameras(self, meta: dict[str, Any], source: Path) -> tuple[Cameras, Tensor, float]:
@@ -169,9 +165,8 @@ class NrfgsDataParser(DataParser):
         scaled = config.auto_scale_poses and len(frames) > 1
         poses = checks.check_poses(frames, source, need_spread=scaled)
         orientation = meta.get("orientation_override", config.orientation_method)
-        if orientation not in ORIENTATIONS:
-            fix = f"Use one of {', '.join(ORIENTATIONS)}, or remove it."
-            raise InputError(f"{source}: orientation_override is {shown(repr(orientation))}. {fix}")
+        needed = f"one of {', '.join(ORIENTATIONS)}, or removed"
+        require(orientation in ORIENTATIONS, f"{source}: orientation_override", shown(repr(orientation)), needed)
         placed, transform, scale = place(poses, orientation, config.center_method, scaled, config.scale_factor)
         kind = CAMERA_MODEL_TO_TYPE[meta.get("camera_model", "OPENCV")]
         if kind == CameraType.FISHEYE:
@@ -227,20 +222,19 @@ class NrfgsDataParser(DataParser):
         root = self._root(key)
         return root.with_name(f"{root.name}_{factor}")
 
-    def _check_sizes(
-        self, frames: list[dict[str, Any]], source: Path, factor: int, full_sizes: list[Any], sizes: list[Any]
-    ) -> None:
-        """Check that images and masks have the size of their cameras, or the full one without smaller copies."""
+    def _check_sizes(self, meta: dict[str, Any], source: Path, factor: int, full: Tensor, small: Tensor) -> None:
+        """Check that images and masks have the size of their cameras, or the full one without smaller copies, [V, 2]
+        each."""
         for key, kind in FOLDERS.items():
-            paths = self._files(frames, key, factor)
+            paths = self._files(meta["frames"], key, factor)
             if paths and self._has_copies(key, factor):
                 checks.check_unique(paths, f"{source}: frames")
                 folder = self._copies(key, factor)
                 fix = f"Remove {folder}, or with `colmap` give --downscale-rounding-mode round or ceil."
-                checks.check_headers(paths, sizes, kind, fix)
+                checks.check_headers(paths, small.tolist(), kind, fix)
             elif paths:
                 fix = "Use the images of the poses, or scale w, h, fl_x, fl_y, cx and cy with them; masks are as large."
-                checks.check_headers(paths, full_sizes, kind, fix)
+                checks.check_headers(paths, full.tolist(), kind, fix)
 
     @cached_property
     def _placed_points(self) -> dict[str, Tensor]:
@@ -341,8 +335,6 @@ def rounded(place: np.ndarray, extent: float) -> np.ndarray:
 
 def read_transforms(data: Path) -> tuple[dict[str, Any], Path]:
     """The content of the transforms.json of `data`, a folder or the file itself, with at least one frame; its path."""
-    if not os.path.exists(data):
-        raise InputError(f"{shown(str(data))}: no such file or folder. Check the path in --data or config.yml.")
     source = data if data.suffix == ".json" else data / "transforms.json"
     if not source.is_file():
         fix = (
@@ -354,10 +346,9 @@ def read_transforms(data: Path) -> tuple[dict[str, Any], Path]:
         raise InputError(f"{source} is missing. {fix}")
     if source.stat().st_size > LONGEST_JSON:
         raise InputError(f"{source} is larger than {LONGEST_JSON} bytes. Make it anew.")
-    try:
+    fix = "Repair the file or make it anew."
+    with refusing(f"{source} cannot be read as JSON", fix, OSError, ValueError, RecursionError):
         meta = json.loads(source.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{source} cannot be read as JSON: {error}. Repair the file or make it anew.") from error
     frames = meta.get("frames") if isinstance(meta, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise InputError(f"{source}: `frames` must be a non-empty list of objects. Make the file anew.")

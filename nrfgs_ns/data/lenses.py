@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
-from nrfgs_ns.data.checks import PIXELS, shown
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.data.checks import PIXELS
+from nrfgs_ns.errors import InputError, shown
 
 LENS = ("fx", "fy", "cx", "cy", "width", "height")
 """Fields of a camera that undistortion changes."""

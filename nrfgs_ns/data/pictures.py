@@ -16,7 +16,7 @@ import psutil
 from PIL import ExifTags, Image
 from rich.progress import track
 
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import InputError, refusing
 
 FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP", "PPM")
 """Formats that PIL may open, by a file's first bytes; for some others it would start Ghostscript."""
@@ -29,18 +29,18 @@ HALF = 127
 BYTES_PER_PIXEL = 16
 """Memory for decoding a picture: decoded, converted, resized or undistorted, and a tensor."""
 
+RESTORE = "Restore or remove it."
+"""The fix for a broken file, for which PIL may raise anything."""
+
 Result = TypeVar("Result")
 
 
 @cache
-def reads_heif() -> bool:
-    """Whether PIL reads HEIF, from now on."""
-    try:
-        import pillow_heif
-    except ImportError:
-        return False
+def read_heif() -> None:
+    """Let PIL read HEIF from now on; ImportError without pillow-heif."""
+    import pillow_heif
+
     pillow_heif.register_heif_opener()
-    return True
 
 
 def is_heif(path: Path) -> bool:
@@ -52,20 +52,12 @@ def is_heif(path: Path) -> bool:
 
 def open_picture(path: Path) -> Image.Image:
     """An image whose header alone is read; InputError if it is of no known format."""
-    heif = is_heif(path)
-    if heif and not reads_heif():
-        raise InputError(f"{path} is a HEIC photograph: run `pip install pillow-heif`, or convert it to JPEG.")
-    with naming(path, "is not a readable image"):
+    if heif := is_heif(path):
+        fix = "Run `pip install pillow-heif`, or convert it to JPEG."
+        with refusing(f"{path} is a HEIC photograph", fix, ImportError):
+            read_heif()
+    with refusing(f"{path} is not a readable image", RESTORE, Exception):
         return Image.open(path, formats=(*FORMATS, "HEIF") if heif else FORMATS)
-
-
-@contextlib.contextmanager
-def naming(path: Path, finding: str) -> Iterator[None]:
-    """Turn what PIL raises for a broken file, which can be anything, into InputError."""
-    try:
-        yield
-    except Exception as error:
-        raise InputError(f"{path} {finding} ({str(error) or type(error).__name__}). Restore or remove it.") from error
 
 
 def picture_names(paths: Sequence[Path]) -> list[str]:
@@ -94,7 +86,7 @@ def read_picture(path: Path) -> Image.Image:
     with open_picture(path) as image:
         check_depth(image, path)
         transparent = image.mode.endswith(("A", "a")) or (image.mode == "P" and "transparency" in image.info)
-        with naming(path, "cannot be decoded"):
+        with refusing(f"{path} cannot be decoded", RESTORE, Exception):
             return image.convert("RGBA" if transparent else "RGB")
 
 
@@ -103,7 +95,7 @@ def read_mask(path: Path) -> Image.Image:
     with open_picture(path) as image:
         if image.mode not in MASK_MODES:
             raise InputError(f"{path}: a mask has one grey channel, 0 outside and more inside. Save it as 8-bit grey.")
-        with naming(path, "cannot be decoded"):
+        with refusing(f"{path} cannot be decoded", RESTORE, Exception):
             inside = np.array(image) > (HALF if image.format == "JPEG" else 0)
     return Image.fromarray(inside.astype(np.uint8) * 255)
 
@@ -128,9 +120,8 @@ def in_parallel(
     with ThreadPoolExecutor(max(int(workers), 1)) as pool:
         try:
             yield from track(pool.map(read, range(len(sizes))), what, len(sizes), console=CONSOLE, transient=True)
-        except BaseException:
+        finally:
             pool.shutdown(cancel_futures=True)
-            raise
 
 
 def cache_folder() -> Path:

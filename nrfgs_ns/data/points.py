@@ -14,10 +14,10 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from plyfile import PlyData
 
-from nrfgs_ns.data.checks import shown, some, warn
+from nrfgs_ns.data.checks import some, warn
 from nrfgs_ns.data.lenses import undistorted_cameras
 from nrfgs_ns.data.views import in_view
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import InputError, refusing, shown
 
 GREY = 127
 """Colour of points that have none."""
@@ -41,7 +41,8 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     fix = "Repair or replace it, or remove ply_file_path from transforms.json to start from random points."
     if not os.path.isfile(path):  # False, too, for a name that cannot be
         raise InputError(f"{shown(str(path))}, named by ply_file_path, is missing. {fix}")
-    try:
+    # plyfile lets out whatever it meets in a broken file
+    with refusing(f"{path} cannot be read as vertices with x, y, z", fix, Exception):
         with path.open("rb") as file:
             if b"end_header" not in file.read(LONGEST_HEADER):
                 raise ValueError(f"no end_header in its first {LONGEST_HEADER} bytes")
@@ -49,8 +50,6 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
         stored = _columns(vertices, "xyz")
         has_colors = {"red", "green", "blue"} <= set(vertices.dtype.names)
         rgb = _columns(vertices, ("red", "green", "blue")) if has_colors else np.full(stored.shape, GREY)
-    except Exception as error:  # plyfile lets out whatever it meets in a broken file
-        raise InputError(f"{path} cannot be read as vertices with x, y, z ({shown(str(error))}). {fix}") from error
     if not has_colors:
         warn(f"{path} has no colours; its points start in mid grey.")
     rgb = rgb.astype(np.float64) * (255.0 if rgb.dtype.kind == "f" else 1.0)

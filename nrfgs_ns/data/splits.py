@@ -10,7 +10,7 @@ from nerfstudio.data.utils import dataparsers_utils as nerfstudio_splits
 
 from nrfgs_ns.data.checks import check_unique, some, warn
 from nrfgs_ns.data.views import interior_test_images
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import InputError, refusing, require
 
 SPLITS = ("train", "val", "test")
 """nerfstudio's names of the parts of a data set."""
@@ -51,15 +51,13 @@ def split_by_rule(config: Any, images: list[Path], source: Path) -> Rows:
     if count == 1:
         train, evaluated = [0], []
     elif mode == "interior":
-        if every < 2:
-            raise InputError(f"--eval-interval is {every}. Give 2 or more, or choose another --eval-mode.")
+        require(every >= 2, "--eval-interval", every, "2 or more with --eval-mode interior")
         evaluated = interior_test_images(count, every)
         train = np.setdiff1d(np.arange(count), evaluated)
     else:
         option = {"fraction": [config.train_split_fraction], "interval": [every]}.get(mode, [])
-        try:
+        finding = f"{source}: --eval-mode {mode} cannot split the images"
+        with refusing(finding, "Use another.", AssertionError, ValueError, KeyError):
             train, evaluated = getattr(nerfstudio_splits, f"get_train_eval_split_{mode}")(images, *option)
-        except (AssertionError, ValueError, KeyError) as error:
-            raise InputError(f"{source}: --eval-mode {mode} cannot split the images ({error}). Use another.") from error
     train, evaluated = (np.asarray(rows, dtype=np.int64) for rows in (train, evaluated))
     return {"train": train, "val": evaluated, "test": evaluated}

@@ -96,7 +96,7 @@ class ShardedGuard(Guard):
         try:
             super().settle()
         except TrainingStopped as stopped:  # on all devices
-            raise self._together(stopped) from None
+            self._stop_together(stopped)
 
     def check_parameters(self, optimizers: LeanOptimizers) -> None:
         stopped = None
@@ -104,18 +104,19 @@ class ShardedGuard(Guard):
             super().check_parameters(optimizers)
         except TrainingStopped as error:
             stopped = error
-        if any(comm.gather(stopped is not None)):
-            raise self._together(stopped) from None
+        self._stop_together(stopped)
 
-    def _together(self, stopped: TrainingStopped | None) -> TrainingStopped:
-        """One exception for all devices: from the first whose own image or loss is bad, which spreads to all
-        gradients; otherwise of the first that found something itself."""
+    def _stop_together(self, stopped: TrainingStopped | None) -> None:
+        """Raise one exception on all devices if any has one: from the first whose own image or loss is bad, which
+        spreads to all gradients; otherwise of the first that found something itself."""
         mine = None if stopped is None else (str(stopped), stopped.step, stopped.origin, stopped.savable)
         stops = [(device, *stop) for device, stop in enumerate(comm.gather(mine)) if stop is not None]
+        if not stops:
+            return
         own = [stop for stop in stops if stop[3] != "elsewhere"]
         device, message, step, origin, _ = next((stop for stop in own if stop[3] == "rendering"), own[0])
         savable = all(stop[4] for stop in stops)
-        return TrainingStopped(f"On device {device} of {comm.world()}: {message}", step, origin, savable)
+        raise TrainingStopped(f"On device {device} of {comm.world()}: {message}", step, origin, savable) from None
 
 
 def map_moments(state: Mapping[str, Any], change: Callable[[Tensor], Any]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Literal
 
 import tyro
 
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import InputError, require
 from nrfgs_ns.files import check_writable
 from nrfgs_ns.trained.command import NamesTraining
 
@@ -53,8 +53,7 @@ class Ply(_Format):
 
     def main(self) -> None:
         config = self.checked(self.output)
-        if self.steps is not None and self.steps < 0:
-            raise InputError(f"--steps is {self.steps}; it must be at least 0.")
+        require(self.steps is None or self.steps >= 0, "--steps", self.steps, "at least 0")
         from nrfgs_ns.export.ply import export_ply
 
         export_ply(config, self)
@@ -73,11 +72,10 @@ class Compact(_Format):
     found while it trains, and rate is where it begins"""
 
     def checked(self, *files: Path) -> Path:
-        for name in ("finetune", "rate"):
-            if not (value := getattr(self, name)) >= 0:
-                raise InputError(f"--{name} is {value}; it must be zero or positive.")
-        if self.size_mb is not None and not 0 < self.size_mb < math.inf:
-            raise InputError(f"--size-mb is {self.size_mb}; it must be positive, in millions of bytes.")
+        for name, value in (("--finetune", self.finetune), ("--rate", self.rate)):
+            require(value >= 0, name, value, "zero or positive")
+        size = self.size_mb
+        require(size is None or 0 < size < math.inf, "--size-mb", size, "positive, in millions of bytes")
         return super().checked(*files)
 
     def main(self) -> None:

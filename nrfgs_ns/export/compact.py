@@ -22,7 +22,7 @@ from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.command import Compact
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.progress import progress
-from nrfgs_ns.threads import few_threads
+from nrfgs_ns.threads import draws_small, few_threads
 from nrfgs_ns.trained.loading import find_data, finish, load_model, lost, measure_loss
 from nrfgs_ns.training.config_file import read_config
 from nrfgs_ns.training.pipeline import NrfgsPipeline
@@ -36,12 +36,14 @@ MOST_ATTEMPTS = 10
 PLY_BYTES = 62 * 4
 """Bytes of a splat in 3DGS's PLY file, with harmonics of degree 3."""
 
+Total = Callable[[int], int]
+"""Bytes of the compact file -> bytes of all that is written, which may have `--size-mb`."""
+
 
 def export_compact(load_config: Path, options: Compact) -> None:
     """Write a compact file, and report its size and loss; see `nrfgs export compact --help`."""
-    with few_threads() as threads:
-        pipeline = load_field(load_config, options.measure)
-        threads.suit_to(pipeline)
+    pipeline = load_field(load_config, options.measure)
+    with few_threads(draws_small(pipeline)):
         config, numbers = write_file(pipeline, load_config, output := options.output, options)
     count, size, ply_size = (numbers[name] for name in ("written", "bytes", "ply_bytes"))
     lines = [
@@ -66,13 +68,9 @@ def load_field(load_config: Path, measured: bool) -> NrfgsPipeline:
 
 
 def write_file(
-    pipeline, load_config: Path, output: Path, options: Compact, total: Callable[[int], int] = lambda size: size
+    pipeline, load_config: Path, output: Path, options: Compact, total: Total = lambda size: size
 ) -> tuple[Path, dict[str, Any]]:
-    """Write a compact file; returns the config.yml with which nerfstudio reads it, and numbers for a report.
-
-    Args:
-        total: bytes of the compact file -> bytes of all that is written, for `options.size_mb`.
-    """
+    """Write a compact file; returns the config.yml with which nerfstudio reads it, and numbers for a report."""
     model = pipeline.model
     field = model.field.detached()
     steps = rate = None
@@ -117,7 +115,7 @@ def write_file(
     return config, numbers
 
 
-def size_of_tables(field: Field, render: dict[str, Any], limit: float, total: Callable[[int], int]) -> float:
+def size_of_tables(field: Field, render: dict[str, Any], limit: float, total: Total) -> float:
     """Bytes of the tables with which all that is written has AIM of a limit; InputError if nothing would be left."""
     header, streams = encode(field, render)
     rest = len(container(header, {name: stream for name, stream in streams.items() if name not in TABLES}))
@@ -128,11 +126,7 @@ def size_of_tables(field: Field, render: dict[str, Any], limit: float, total: Ca
 
 
 def encoded(
-    field: Field,
-    render: dict[str, Any],
-    steps: Mapping[str, np.ndarray] | None,
-    limit: float,
-    total: Callable[[int], int],
+    field: Field, render: dict[str, Any], steps: Mapping[str, np.ndarray] | None, limit: float, total: Total
 ) -> tuple[bytes, float]:
     """A compact file, and the factor of its grids' steps: 1, unless all that is written would have more than `limit`
     bytes. Then it has at most these, and more than ENOUGH of them after few attempts; InputError if the coarsest file

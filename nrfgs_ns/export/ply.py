@@ -28,7 +28,7 @@ from nrfgs_ns.files import whole
 from nrfgs_ns.model.harmonics_fit import PlainSplats
 from nrfgs_ns.model.pinholes import pinhole
 from nrfgs_ns.rasterizer import ProjectionOptions, composite_view, project_view
-from nrfgs_ns.threads import few_threads
+from nrfgs_ns.threads import draws_small, few_threads
 from nrfgs_ns.trained.loading import finish, load_model, lost, measure_loss
 
 PROPERTIES = (
@@ -51,9 +51,8 @@ WORTH_A_WORD = 0.1
 def export_ply(load_config: Path, options: Ply) -> None:
     """Write a PLY file, and report what it costs; see `nrfgs export ply --help`."""
     output = options.output
-    with few_threads() as threads:
-        pipeline = load_model(load_config, "test" if options.measure else "inference", options.measure)
-        threads.suit_to(pipeline)
+    pipeline = load_model(load_config, "test" if options.measure else "inference", options.measure)
+    with few_threads(draws_small(pipeline)):
         pipeline.model.fit_on(pipeline.cameras_to_fit, options.steps)
         begin = perf_counter()
         fit = pipeline.model.fit

@@ -70,12 +70,11 @@ class Eval(NamesTraining):
         check_writable(self.output_path, "--output-path")
         if (pictures := self.render_output_path) is not None:
             check_writable(pictures / "eval.png", "--render-output-path")
-        from nrfgs_ns.threads import few_threads
+        from nrfgs_ns.threads import draws_small, few_threads
         from nrfgs_ns.trained.loading import load_training
 
-        with few_threads() as threads:
-            trained = load_training(path, "test")
-            threads.suit_to(trained.pipeline)
+        trained = load_training(path, "test")
+        with few_threads(draws_small(trained.pipeline)):
             results = trained.pipeline.get_average_eval_image_metrics(output_path=pictures, get_std=True)
         numbers = {name: getattr(trained.config, name) for name in ("experiment_name", "method_name")}
         numbers |= {"checkpoint": str(trained.checkpoint), "results": results}
@@ -96,25 +95,24 @@ class View(NamesTraining):
     def main(self) -> None:
         path = self.config()
         from nrfgs_ns.compact.format import MAGIC
-        from nrfgs_ns.threads import few_threads
+        from nrfgs_ns.threads import SMALL, draws_small, few_threads
         from nrfgs_ns.viewer.server import LocalViewerConfig
 
         config = LocalViewerConfig(websocket_host=self.host, websocket_port=self.port)
-        with few_threads() as threads:
-            if path.read_bytes().startswith(MAGIC):
-                threads.suit(view_file(path, config).pipeline.model.num_points)
+        if path.read_bytes().startswith(MAGIC):
+            with few_threads(view_file(path, config).pipeline.model.num_points < SMALL):
                 while True:
                     sleep(1)
-            from nerfstudio.scripts.viewer.run_viewer import _start_viewer
+        from nerfstudio.scripts.viewer.run_viewer import _start_viewer
 
-            from nrfgs_ns.trained.loading import load_training
+        from nrfgs_ns.trained.loading import load_training
 
-            trained = load_training(path, "test")
-            threads.suit_to(trained.pipeline)
-            # Nerfstudio looks here for the config.yml that its command for ns-render names; it writes nothing.
-            config.relative_log_filename = str(path.absolute().parent / "viewer.log")
-            trained.config.vis = "viewer"
-            trained.config.viewer = config
+        trained = load_training(path, "test")
+        # Nerfstudio looks here for the config.yml that its command for ns-render names; it writes nothing.
+        config.relative_log_filename = str(path.absolute().parent / "viewer.log")
+        trained.config.vis = "viewer"
+        trained.config.viewer = config
+        with few_threads(draws_small(trained.pipeline)):
             _start_viewer(trained.config, trained.pipeline, trained.step)
 
 

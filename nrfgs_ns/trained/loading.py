@@ -21,6 +21,7 @@ from nrfgs_ns.image.metrics import psnr
 from nrfgs_ns.model.config import NrfgsModelConfig
 from nrfgs_ns.model.model import NrfgsModel
 from nrfgs_ns.progress import progress
+from nrfgs_ns.threads import few_threads
 from nrfgs_ns.training.checkpoint_files import find, read_latest
 from nrfgs_ns.training.config_file import read_config
 from nrfgs_ns.training.pipeline import NrfgsPipeline, NrfgsPipelineConfig
@@ -36,6 +37,7 @@ class Trained(NamedTuple):
     step: int
 
 
+@few_threads()
 def load_training(path: Path, mode: Literal["test", "inference"]) -> Trained:
     """A finished training, set up as by nerfstudio's `eval_setup`, except that its config.yml runs no code.
 
@@ -87,6 +89,7 @@ def load_model(path: Path, mode: Literal["test", "inference"], measured: bool = 
     return pipeline
 
 
+@few_threads()
 def load_file(path: Path) -> NrfgsModel:
     """The model in a compact file, in evaluation mode, without config.yml or data set; InputError as `decode`."""
     decoded = decode(path)
@@ -119,7 +122,6 @@ def measure_loss(pipeline, pictures: Callable[[Any], dict[str, Tensor]]) -> dict
     model, data = pipeline.model, pipeline.datamanager
     names = picture_names(data.eval_dataset.image_filenames)
     per_image = []
-    scores = {}
     with progress("Measuring the loss", len(names)) as advance:
         for image, (camera, batch) in zip(names, data.fixed_indices_eval_dataloader, strict=True):
             outputs = model.get_outputs_for_camera(camera)

@@ -45,9 +45,8 @@ class ParameterMean:
     def add(self, optimizers: Mapping[str, Optimizer]) -> None:
         """Add the present parameters to the mean."""
         if not self.is_current(optimizers):
-            parameters = _parameters(optimizers)
-            self._means = {name: torch.zeros_like(parameter) for name, parameter in parameters.items()}
-            self._parameters = parameters
+            self._parameters = _parameters(optimizers)
+            self._means = {name: torch.zeros_like(parameter) for name, parameter in self._parameters.items()}
             self.count = 0
         self.count += 1
         torch._foreach_lerp_(list(self._means.values()), list(self._parameters.values()), 1.0 / self.count)
@@ -76,8 +75,7 @@ class ParameterMean:
     def is_current(self, optimizers: Mapping[str, Optimizer]) -> bool:
         """Whether rows still denote the splats that were averaged: the parameters are these very objects."""
         parameters = _parameters(optimizers)
-        same = self._parameters.keys() == parameters.keys()
-        return same and all(parameter is self._parameters[name] for name, parameter in parameters.items())
+        return all(self._parameters.get(name) is parameter for name, parameter in parameters.items())
 
 
 def _parameters(optimizers: Mapping[str, Optimizer]) -> dict[str, Tensor]:

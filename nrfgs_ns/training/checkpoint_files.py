@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from nrfgs_ns.data.checks import warn
-from nrfgs_ns.errors import ForTheUser, InputError
+from nrfgs_ns.errors import ForTheUser, InputError, refusing
 
 NAME = re.compile(r"step-(\d{9,})\.ckpt")
 """Names of checkpoints; other files in the folder are ignored."""
@@ -37,8 +37,7 @@ def allow_nerfstudio_checkpoints() -> None:
 
 def find(folder: Path) -> dict[int, Path]:
     """Checkpoints in a folder by step, the newest first; empty if there is no folder."""
-    files = folder.iterdir() if folder.is_dir() else ()
-    by_step = {int(match[1]): file for file in files if (match := NAME.fullmatch(file.name))}
+    by_step = {int(match[1]): file for file in folder.glob("*") if (match := NAME.fullmatch(file.name))}
     return dict(sorted(by_step.items(), reverse=True))
 
 
@@ -75,7 +74,8 @@ def write(folder: Path, step: int, content: dict[str, Any], only_latest: bool = 
 def read(path: Path) -> dict[str, Any]:
     """Read a checkpoint into host memory; InputError where a byte is not as it was written."""
     allow_nerfstudio_checkpoints()
-    try:
+    # Damage to a zip archive, or to a pickle in it, can raise anything.
+    with refusing(f"{path} is damaged", "Restore it from a copy, or take another one.", Exception):
         with zipfile.ZipFile(path) as archive:
             if (bad := archive.testzip()) is not None:
                 raise ValueError(f"the checksum of its record {bad} is wrong")
@@ -83,11 +83,6 @@ def read(path: Path) -> dict[str, Any]:
         if not isinstance(content, dict) or not {"step", "pipeline"} <= content.keys():
             raise ValueError("it is not a checkpoint of nerfstudio")
         return content
-    except FileNotFoundError:
-        raise
-    except Exception as error:  # damage to a zip archive, or to a pickle in it, can raise anything
-        reason = next(iter(str(error).splitlines()), type(error).__name__)[:200]
-        raise InputError(f"{path} is damaged: {reason}. Restore it from a copy, or take another one.") from error
 
 
 def read_latest(folder: Path, step: int | None = None) -> tuple[Path, dict[str, Any]]:

@@ -11,10 +11,10 @@ from typing import Any
 import torch
 from nerfstudio.data.datasets.base_dataset import InputDataset
 
-from nrfgs_ns.data.checks import shown, some
+from nrfgs_ns.data.checks import some
 from nrfgs_ns.data.lenses import LENS
 from nrfgs_ns.densification import DensificationConfig
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import InputError, shown
 
 MEANING = (
     "pipeline.model.appearance.",

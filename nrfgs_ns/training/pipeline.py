@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nerfstudio's pipeline with early checks, evaluation in which a metric may be missing, and exact resume."""
+"""Nerfstudio's pipeline with early checks, evaluation in which a metric may be missing, and exact resume; and a step of
+a training."""
 
 import json
 import random
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
-from functools import partial
+from functools import partial, reduce
 from pathlib import Path
 from statistics import fmean, median
 from time import perf_counter
@@ -18,6 +19,8 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import track
 from rich.table import Column, Table
+from torch import Tensor
+from torch.nn import Parameter
 from torchvision.utils import save_image
 
 from nrfgs_ns.appearance.head import AppearanceHead
@@ -43,6 +46,8 @@ from nrfgs_ns.viewer.panel import ViewerPanel
 
 SHOWN = ("psnr", "cc_psnr", "ssim", "cc_ssim", "ms_ssim", "lpips", "l1", "seconds_per_image", "splats")
 """Columns of an evaluation's table."""
+
+Gradients = dict[Parameter, Tensor]
 
 
 @dataclass
@@ -205,6 +210,30 @@ class NrfgsPipeline(VanillaPipeline):
         version, numbers, gauss_next = json.loads(state["python_rng"])
         random.setstate((version, tuple(numbers), gauss_next))
         self.datamanager.load_sampling_state(state["sampling"])
+
+
+def descend(training, step: int, pulled: Gradients, with_metrics: bool = False) -> tuple[Tensor, dict, dict]:
+    """Make the step of a trainer or of a twin, down the loss of its next photograph.
+
+    Args:
+        training: has `pipeline`, `guard`, `optimizers`, `graphs` (None: steps are not recorded) and `world_size`.
+        pulled: added to the gradients.
+
+    Returns:
+        the loss, its terms, and metrics if wanted.
+    """
+    optimizers = training.optimizers
+    training.guard.begin(step, optimizers, settled_later=training.graphs is not None)
+    optimizers.zero_grad_all()
+    _, losses, metrics = training.pipeline.get_train_loss_dict(step, training.graphs, with_metrics)
+    loss = reduce(torch.add, losses.values())
+    if loss.requires_grad:  # a recorded step has made its gradients already
+        loss.backward(torch.full_like(loss, 1.0 / training.world_size))  # the mean of the devices' losses
+    for parameter, gradient in pulled.items():
+        parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
+    training.guard.before_optimizers(optimizers)
+    optimizers.step()
+    return loss, losses, metrics
 
 
 def kernels_of(head: AppearanceHead) -> tuple[Callable[[torch.device], object], ...]:

@@ -3,6 +3,7 @@
 changes no number of the training."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import timedelta
 from threading import Lock
@@ -61,7 +62,8 @@ class ProgressLine(LocalWriter):
         super().__init__(config, banner_messages)
         for message in banner_messages or []:
             CONSOLE.print(message, markup=False, soft_wrap=True)
-        self._pipeline: Any = None
+        self._quality: Callable[[], list[str]] = list
+        """what is said of the test view; nothing, until `watch` names one"""
         self._live: Live | None = None
         self._last: tuple[int, float] | None = None
         """step and time of the last update"""
@@ -73,11 +75,16 @@ class ProgressLine(LocalWriter):
         data = pipeline.datamanager
         views = data.eval_dataset.image_filenames
         if views:
-            self._pipeline, self._lock = pipeline, lock
-            self._view = len(views) // 2
-            name = views[self._view]
+            middle = len(views) // 2
+            name = views[middle]
             kind = "training" if name in data.train_dataset.image_filenames else "test"
-            self._view_name = f"{kind} view {name.name}"
+
+            def quality() -> list[str]:
+                with lock:
+                    value = psnr_of(pipeline, middle)
+                return [] if value is None else [f"{value:.1f} dB on {kind} view {name.name}"]
+
+            self._quality = quality
 
     def write_stats_log(self, step: int) -> None:
         """Nothing: the trainer calls `update` after each step. Nerfstudio's first call names another step."""
@@ -99,17 +106,13 @@ class ProgressLine(LocalWriter):
             self._live = None
 
     def update(self, step: int, is_last: bool = False) -> None:
-        """Update the line if it is due or the training ends."""
+        """Update the line, if one is wanted, where it is due or the training ends."""
         start = perf_counter()
-        if start < self._due and not is_last:
+        if not self.config.enable or (start < self._due and not is_last):
             return
         total = max(writer.GLOBAL_BUFFER["max_iter"], step + 1)
         done = (step + 1) / total
-        parts = [f"step {step + 1:,} of {total:,} ({100 * done:.0f} %)"]
-        if self._pipeline is not None:
-            with self._lock:
-                quality = psnr_of(self._pipeline, self._view)
-            parts += [] if quality is None else [f"{quality:.1f} dB on {self._view_name}"]
+        parts = [f"step {step + 1:,} of {total:,} ({100 * done:.0f} %)", *self._quality()]
         if self._last is not None and step > self._last[0]:
             rate = (step - self._last[0]) / max(start - self._last[1], 1e-9)
             parts.append(f"{rate:.3g} steps/s")

@@ -30,11 +30,12 @@ from nrfgs_ns.training.guard import Guard, TrainingStopped
 from nrfgs_ns.training.identity import check_options, options_of
 from nrfgs_ns.training.optimizers import LeanOptimizers
 from nrfgs_ns.training.pace import Pace, TimedPace, resume
-from nrfgs_ns.training.progress import ProgressLine, end_earlier_logs
+from nrfgs_ns.training.pipeline import descend
+from nrfgs_ns.training.progress import ProgressLine, ProgressLineConfig, end_earlier_logs
 from nrfgs_ns.training.step_graph import StepGraphs
 from nrfgs_ns.training.stopping import StopRequest, heard_signals, is_out_of_memory, rows_agree
 from nrfgs_ns.training.trainer_config import NrfgsTrainerConfig, report_choices
-from nrfgs_ns.training.twin import Twin, descend, twin_of
+from nrfgs_ns.training.twin import Twin, twin_of
 
 NOTHING_TO_SAVE = "Stopped before the first step; there is nothing to save."
 
@@ -43,8 +44,8 @@ class NrfgsTrainer(Trainer):
     """Trainer that never leaves a torn checkpoint, or one with NaN, where `--load-dir` would find it."""
 
     config: NrfgsTrainerConfig
-    line: ProgressLine | None
-    """None: nothing is shown, or nerfstudio's table"""
+    line: ProgressLine
+    """one that is not enabled where nothing is shown, or nerfstudio's table"""
     pace: Pace | None = None
     """position on the schedules; None: the step"""
     steps_are_chosen = False
@@ -57,10 +58,6 @@ class NrfgsTrainer(Trainer):
     """a second training to agree with; None: none"""
     _stop = False
     _saved_step: int | None = None
-
-    def __init__(self, config: NrfgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
-        self.request = StopRequest()
-        super().__init__(config, local_rank, world_size)
 
     @property
     def stop_training(self) -> bool:
@@ -83,13 +80,15 @@ class NrfgsTrainer(Trainer):
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         end_earlier_logs()
+        self.request = StopRequest()
         try:
             super().setup(test_mode)
         except KeyboardInterrupt:
             NrfgsTrainer._end(self, NOTHING_TO_SAVE, 130)
         writer.GLOBAL_BUFFER["max_iter"] = self.last_step + 1
-        self.line = next((log for log in writer.EVENT_WRITERS if isinstance(log, ProgressLine)), None)
-        if self.line is not None and self.world_size == 1:  # with several, no device can draw alone
+        silent = ProgressLine(ProgressLineConfig(enable=False))
+        self.line = next((log for log in writer.EVENT_WRITERS if isinstance(log, ProgressLine)), silent)
+        if self.world_size == 1:  # with several, no device can draw alone
             self.line.watch(self.pipeline, self.train_lock)
         self._completed_step = self._start_step - 1
         """the last step that was completed"""
@@ -189,8 +188,7 @@ class NrfgsTrainer(Trainer):
                 super().train()
         finally:
             gc.unfreeze()
-            if self.line is not None:
-                self.line.close()
+            self.line.close()
 
     def _update_viewer_state(self, step: int) -> None:
         """Nerfstudio's with fewer events, since logging each step's duration takes the host longer than some kernels
@@ -198,12 +196,11 @@ class NrfgsTrainer(Trainer):
         super()._update_viewer_state(step)
         if step % self.config.logging.steps_per_log != 0:
             writer.EVENT_STORAGE.clear()
-        if self.line is not None:
-            self.line.update(step)
+        self.line.update(step)
 
     @check_eval_enabled
     def eval_iteration(self, step: int) -> None:
-        if self.line is not None and step_check(step, self.config.steps_per_eval_all_images):
+        if step_check(step, self.config.steps_per_eval_all_images):
             self.line.step_aside()  # the evaluation has a progress bar of its own
         super().eval_iteration(step)
         config = self.config
@@ -261,8 +258,7 @@ class NrfgsTrainer(Trainer):
                 outcome = f"Stopped at step {self._completed_step}, saved. {self._save_once()}"
             self._end(outcome, 128 + self._signal)
         self.install_mean(stopped=self._stop and not timed_out)
-        if self.line is not None:
-            self.line.finish(self._completed_step)
+        self.line.finish(self._completed_step)
         super()._after_train()
 
     def _save_once(self) -> str:

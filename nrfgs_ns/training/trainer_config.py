@@ -16,9 +16,8 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from nrfgs_ns.data.checks import shown
 from nrfgs_ns.data.dataparser import NrfgsDataParserConfig
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import InputError, refusing, require, shown
 from nrfgs_ns.training import checkpoint_files
 from nrfgs_ns.training.config_file import check_types
 from nrfgs_ns.training.pace import FEWEST_STEPS, STEPS, Pace, TimedPace, steps_for
@@ -75,9 +74,8 @@ class NrfgsTrainerConfig(TrainerConfig):
             fix = "Leave it out, or make them transparent and choose --pipeline.model.background-color."
             name = "pipeline.datamanager.dataparser.mask_color"
             raise InputError(f"{name} is {color}; masked pixels are not trained on, whatever their colour. {fix}")
-        if (order := data.train_cameras_sampling_strategy) != "random":
-            name = "pipeline.datamanager.train_cameras_sampling_strategy"
-            raise InputError(f"{name} is {order}; these methods draw cameras at random. Leave it out.")
+        order = data.train_cameras_sampling_strategy
+        require(order == "random", "pipeline.datamanager.train_cameras_sampling_strategy", order, "random")
         lowest = {
             positive: ("time_budget", "schedule_steps", "pipeline.datamanager.camera_res_scale_factor"),
             0: ("max_num_iterations", "average_steps", "pipeline.datamanager.max_thread_workers", "machine.seed"),
@@ -93,9 +91,8 @@ class NrfgsTrainerConfig(TrainerConfig):
                 limits.append((f"{name}.scheduler.lr_final", schedule.lr_final, positive))
                 limits.append((f"{name}.scheduler.max_steps", schedule.max_steps, schedule.warmup_steps + 1))
         for name, value, low in limits:
-            if value is not None and not low <= value < MOST:
-                least = "positive" if low == positive else f"at least {low}"
-                raise InputError(f"{name} is {value}; it must be {least}, and below 2^32.")
+            least = "positive" if low == positive else f"at least {low}"
+            require(value is None or low <= value < MOST, name, value, f"{least}, and below 2^32")
         if devices == 1 and self.machine.device_type == "cuda" and not torch.cuda.is_available():
             raise InputError("machine.device_type is cuda, but PyTorch finds no GPU (`nrfgs doctor`). Give cpu.")
         check_types(self.pipeline, "config.yml", "pipeline.")
@@ -156,26 +153,22 @@ class NrfgsTrainerConfig(TrainerConfig):
     def _check_tracker(self) -> None:
         """Raise InputError where wandb or comet is missing or lacks a key: nerfstudio starts them when the photographs
         are read. At a terminal wandb asks for its key."""
-        try:
+        fix = "Install it by pip and log in (`wandb login`, `comet login`), or give --vis tensorboard."
+        with refusing(f"vis is {self.vis}, which cannot start", fix, Exception):  # each has its own
             if self.is_wandb_enabled():
                 resolve_name("wandb").login()
             elif self.is_comet_enabled() and not resolve_name("comet_ml").get_config("comet.api_key"):
                 raise ValueError("No API key")
-        except Exception as error:  # each has its own
-            fix = "Install it by pip and log in (`wandb login`, `comet login`), or give --vis tensorboard."
-            raise InputError(f"vis is {self.vis}, which cannot start: {str(error).rstrip('.')}. {fix}") from error
 
     def save_config(self) -> None:
         """Make the training's folder and save config.yml there, with absolute paths; InputError where that fails."""
         data = self.pipeline.datamanager
         dataparser = replace(data.dataparser, data=_absolute(data.dataparser.data))
         pipeline = replace(self.pipeline, datamanager=replace(data, data=_absolute(data.data), dataparser=dataparser))
-        try:
+        with refusing(f"{self.get_base_dir()} cannot be written", "Name another --output-dir.", OSError):
             self._take_a_folder()
             whole = replace(self, pipeline=pipeline, data=_absolute(self.data), output_dir=_absolute(self.output_dir))
             TrainerConfig.save_config(whole)
-        except OSError as error:
-            raise InputError(f"{self.get_base_dir()} cannot be written: {error}. Name another --output-dir.") from error
 
     def _take_a_folder(self) -> None:
         """Make a folder for this training alone, numbering a taken name; one that goes on in its own keeps it."""

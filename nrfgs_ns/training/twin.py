@@ -19,12 +19,12 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
-from torch.nn import Parameter
 
 from nrfgs_ns.data.views import camera_spacing
 from nrfgs_ns.model.loss import loss_of
 from nrfgs_ns.training.guard import Guard
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
+from nrfgs_ns.training.pipeline import Gradients, descend
 from nrfgs_ns.training.step_graph import StepGraphs
 
 START = 6_000
@@ -45,8 +45,6 @@ since two networks would drift in colour together; harmonics do not (results/twi
 JITTER = 0.25
 """Standard deviation of a view's distance from the line between two cameras, in distances between neighbours."""
 
-Gradients = dict[Parameter, Tensor]
-
 
 class Between:
     """Views between neighbouring training cameras.
@@ -56,7 +54,6 @@ class Between:
     """
 
     def __init__(self, cameras: Cameras):
-        self.cameras = cameras
         self.views = [cameras[index : index + 1] for index in range(len(cameras))]
         self.poses = cameras.camera_to_worlds.double().numpy()
         centers, backward = cameras.camera_to_worlds[..., 3], cameras.camera_to_worlds[..., 2]
@@ -158,30 +155,6 @@ def twin_of(trainer) -> Twin | None:
     return Twin(trainer, every) if is_wanted else None
 
 
-def descend(training, step: int, pulled: Gradients, with_metrics: bool = False) -> tuple[Tensor, dict, dict]:
-    """Make the step of a trainer or of a twin, down the loss of its next photograph.
-
-    Args:
-        training: has `pipeline`, `guard`, `optimizers`, `graphs` (None: steps are not recorded) and `world_size`.
-        pulled: added to the gradients.
-
-    Returns:
-        the loss, its terms, and metrics if wanted.
-    """
-    optimizers = training.optimizers
-    training.guard.begin(step, optimizers, settled_later=training.graphs is not None)
-    optimizers.zero_grad_all()
-    _, losses, metrics = training.pipeline.get_train_loss_dict(step, training.graphs, with_metrics)
-    loss = functools.reduce(torch.add, losses.values())
-    if loss.requires_grad:  # a recorded step has made its gradients already
-        loss.backward(torch.full_like(loss, 1.0 / training.world_size))  # the mean of the devices' losses
-    for parameter, gradient in pulled.items():
-        parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
-    training.guard.before_optimizers(optimizers)
-    optimizers.step()
-    return loss, losses, metrics
-
-
 def pull(training, view: Cameras, seen: Tensor, step: int) -> Gradients:
     """Gradients of the photometric loss of a view against the other model's picture of it (`picture`)."""
     model, optimizers = training.pipeline.model, training.optimizers
@@ -199,8 +172,7 @@ def pull(training, view: Cameras, seen: Tensor, step: int) -> Gradients:
 
 def picture(training, view: Cameras, step: int) -> Tensor:
     """A model's picture of a view (`NrfgsModel.picture`), recorded where steps are."""
-    recorded = training.graphs.picture(view, step)
-    if recorded is not None:
+    if (recorded := training.graphs.picture(view, step)) is not None:
         return recorded
     model = training.pipeline.model
     with torch.no_grad():

@@ -26,7 +26,7 @@ from nerfstudio.viewer_legacy.server.viewer_state import ViewerLegacyState
 from viser import _client_autobuild, _messages, infra
 from viser.infra import _infra
 
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import InputError, refusing, require
 from nrfgs_ns.host import VISER
 
 LOCAL, ALL_INTERFACES = "127.0.0.1", "0.0.0.0"
@@ -107,14 +107,12 @@ def _update_without_exceptions(update_scene: Callable[..., None], viewer: Viewer
 
 def _check_address(host: str, port: int | None) -> None:
     """Raise InputError where nothing can listen: viser would wait for ever."""
-    if port is not None and not 0 < port < 2**16:
-        raise InputError(f"The viewer's port is {port}; give one from 1 to {2**16 - 1}.")
-    try:
+    require(port is None or 0 < port < 2**16, "The viewer's port", port, f"from 1 to {2**16 - 1}")
+    fix = "Give an address of this machine."
+    with refusing(f"The viewer cannot listen on {host!r}", fix, OSError, UnicodeError):
         family, kind, *_, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind) as trial:
             trial.bind(address)
-    except (OSError, UnicodeError) as error:
-        raise InputError(f"The viewer cannot listen on {host!r} ({error}). Give an address of this machine.") from error
 
 
 def _refused(*_, **__):

@@ -118,5 +118,5 @@ def test_photographs_of_a_data_set_may_be_heic(capture, renamed):
 
 def test_without_pillow_heif_the_message_says_what_to_install(capture, renamed, no_heif):
     [path.write_bytes(b"\0\0\0\x18ftypheic") for path in renamed]
-    with pytest.raises(InputError, match=r"images/\d+.(heic|jpg) is .*: run `pip install pillow-heif`"):
+    with pytest.raises(InputError, match=r"images/\d+.(heic|jpg) is .*Run `pip install pillow-heif`"):
         capture.parse()

@@ -97,7 +97,7 @@ def step_alone(trainer, cameras) -> dict:
     images, all_losses, stats = [], [], {}
     for camera in cameras:
         outputs = model(camera)
-        losses = model.get_loss_dict(outputs, pipeline.datamanager._image(camera.metadata["cam_idx"]), {})
+        losses = model.get_loss_dict(outputs, pipeline.datamanager.train_view(camera.metadata["cam_idx"])[1], {})
         before = {name: value.grad for name, value in pipeline.named_parameters()}
         pipeline.zero_grad()
         sum(losses.values()).backward()

@@ -261,7 +261,7 @@ def test_a_camera_that_its_matches_contradict_is_left_out(prepared, walls, tmp_p
     (lambda d: None, "no such folder"),
     (lambda d: photo(d / "more" / "a.jpg"), "directly holds 0 photographs"),
     (lambda d: (d.mkdir(), (d / "a.mp4").touch()), "name that file itself"),
-    (lambda d: [photo(d / "a.jpg"), (d / "b.HEIC").touch()], "b.HEIC is .*: run `pip install pillow-heif`"),
+    (lambda d: [photo(d / "a.jpg"), (d / "b.HEIC").touch()], "b.HEIC is .*Run `pip install pillow-heif`"),
     (lambda d: (photo(d / "images" / "a.jpg"), (d / "transforms.json").touch()), "scene already.*ns-train nrfgs"),
     (lambda d: d.write_text("no video"), "neither a folder of photographs nor a video"),
 ])  # fmt: skip
@@ -295,7 +295,7 @@ def test_what_is_refused_before_any_work(three, tmp_path, monkeypatch):
         Run(Prepare(three, tmp_path / "mine"))
     with pytest.raises(InputError, match="--features is 1"):
         Run(Prepare(three, tmp_path / "out", features=1))
-    with pytest.raises(InputError, match="precious.txt/out.*: Not a directory"):
+    with pytest.raises(InputError, match="precious.txt/out cannot be finished .*Not a directory"):
         Prepare(three, tmp_path / "mine" / "precious.txt" / "out").main()
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(InputError, match="pip install pycolmap"):

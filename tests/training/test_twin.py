@@ -14,7 +14,8 @@ from nrfgs_ns.image.ssim import photometric_loss
 from nrfgs_ns.training import twin
 from nrfgs_ns.training.checkpoint_files import read_latest
 from nrfgs_ns.training.guard import TrainingStopped
-from nrfgs_ns.training.twin import descend, picture, pull
+from nrfgs_ns.training.pipeline import descend
+from nrfgs_ns.training.twin import picture, pull
 
 BESIDE = {"--pipeline.model.twin": "on", **REFINING}
 
@@ -77,14 +78,15 @@ def test_few_views_on_a_gpu_have_a_twin(views, device, changed, every, monkeypat
 
 def test_views_lie_between_neighbouring_cameras(tiny_scene, tmp_path, no_cuda, monkeypatch):
     monkeypatch.setattr(twin, "JITTER", 0.0)
-    between = ready(tiny_scene, tmp_path).twin.between
+    trainer = ready(tiny_scene, tmp_path)
+    between, cameras = trainer.twin.between, trainer.pipeline.datamanager.train_dataset.cameras
     for seed in range(20):
         view = between.draw(Random(seed))
         assert view.camera_to_worlds.equal(between.draw(Random(seed)).camera_to_worlds)
         pose, index = view.camera_to_worlds[0], view.metadata["cam_idx"]
         assert_close(pose[:, :3] @ pose[:, :3].T, torch.eye(3), rtol=0, atol=1e-5)
-        assert (view.fx, view.width) == (between.cameras.fx[index], between.cameras.width[index])
-        ends = between.cameras.camera_to_worlds[[index, *between.neighbours[index]], :, 3]
+        assert (view.fx, view.width) == (cameras.fx[index], cameras.width[index])
+        ends = cameras.camera_to_worlds[[index, *between.neighbours[index]], :, 3]
         to_one, to_others = (pose[:, 3] - ends[0]).norm(), (pose[:, 3] - ends[1:]).norm(dim=1)
         assert ((ends[1:] - ends[0]).norm(dim=1) - to_one - to_others).abs().min() < 1e-5  # on a line between two
     poses = torch.eye(4)[:3].repeat(40, 1, 1)

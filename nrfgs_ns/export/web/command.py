@@ -22,7 +22,7 @@ from nrfgs_ns.export.web.guide import read_notes, read_tour
 from nrfgs_ns.export.web.page import page
 from nrfgs_ns.files import write_whole
 from nrfgs_ns.image.metrics import psnr
-from nrfgs_ns.threads import few_threads
+from nrfgs_ns.threads import draws_small, few_threads
 from nrfgs_ns.trained.loading import finish, lost
 
 POSTER_SIDE = 960
@@ -36,11 +36,10 @@ def export_web(load_config: Path, options: Web) -> None:
     output, alone, address = options.output, options.alone, options.address
     if address is not None and not address.startswith(("https://", "http://")):
         raise InputError(f"--address {address} is no web address. Give all of it, with https://.")
-    with few_threads() as threads:
-        pipeline = load_field(load_config, options.measure)
-        names = picture_names(pipeline.datamanager.train_dataset.image_filenames)
-        guide = {"tour": read_tour(options.tour, names), "notes": read_notes(options.notes), "rotate": options.rotate}
-        threads.suit_to(pipeline)
+    pipeline = load_field(load_config, options.measure)
+    names = picture_names(pipeline.datamanager.train_dataset.image_filenames)
+    guide = {"tour": read_tour(options.tour, names), "notes": read_notes(options.notes), "rotate": options.rotate}
+    with few_threads(draws_small(pipeline)):
         about, poster = surroundings(pipeline, names)
         title = output.stem if options.title is None else options.title
         picture = output.with_suffix(".jpg") if alone else output / "preview.jpg"

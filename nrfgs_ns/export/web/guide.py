@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import InputError, refusing, require
 
 VIEWS_A_SECOND = 5
 """Views kept of a camera path; the page puts a smooth curve through them."""
@@ -65,8 +65,7 @@ def _tour_in(file: Path) -> dict[str, Any]:
     if (kind := content.get("camera_type", "perspective")) != "perspective":
         raise InputError(f"{file}: camera_type is {kind}; a page shows perspective paths only.")
     (seconds,) = _numbers([content.get("seconds")], 1, f"{file}: seconds")
-    if not seconds > 0:
-        raise InputError(f"{file}: seconds is {seconds}; it must be positive.")
+    require(seconds > 0, f"{file}: seconds", seconds, "positive")
     loop = bool(content.get("is_cycle", False))
     views = views + views[:1] if loop else views
     count = min(len(views), max(2, math.ceil(VIEWS_A_SECOND * seconds) + 1))
@@ -105,10 +104,8 @@ def _numbers(values: Any, count: int, where: str) -> list[float]:
 
 
 def _json(file: Path) -> dict[str, Any]:
-    try:
+    with refusing(f"{file} cannot be read as JSON", "A page's Save button writes one.", OSError, ValueError):
         content = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file} cannot be read as JSON ({error}).") from error
     if not isinstance(content, dict):
         raise InputError(f"{file} holds no JSON object. A page's Save button writes one.")
     return content
