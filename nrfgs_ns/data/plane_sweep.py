@@ -35,6 +35,8 @@ AGREEING = 2
 """Other views that must find the same depth."""
 WITHIN = 0.01
 """Largest relative difference of depths that are the same."""
+THROUGH = 0.05
+"""Least relative difference of depths at which a view sees through a point, to what is behind it."""
 KEPT = 0.25
 """Share of the points that are kept: all of them were no better on held-out views (results/dense-start.json)."""
 VIEWS = 100.0
@@ -194,30 +196,40 @@ def dense_points(
             planes = inverse_depths(views, one, compared[one], 0.8 * near, 1.5 * far)
             inverse[one], correlation = sweep(views, grey, one, compared[one], planes)
             good[one] = correlation > MIN_CORRELATION
-    found = [_agreed(views, inverse, good, one, others) for one, others in enumerate(compared)]
+    unused = good.clone()
+    found = [_agreed(views, inverse, good, unused, one, others) for one, others in enumerate(compared)]
     xyz, rgb = (torch.cat(tables) for tables in zip(*found, strict=True))
     drawn = torch.rand(len(xyz), generator=torch.Generator().manual_seed(0)).to(xyz.device) < share
     return xyz[drawn], rgb[drawn]
 
 
-def _agreed(views: Views, inverse: Tensor, good: Tensor, one: int, others: Tensor) -> tuple[Tensor, Tensor]:
-    """Points of a view at the same depth in `AGREEING` others; their pixels leave `good`, so that each comes once."""
-    chosen = good[one]
+def _agreed(
+    views: Views, inverse: Tensor, good: Tensor, unused: Tensor, one: int, others: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Points of a view at the same depth in `AGREEING` others, through which no more views see than find them (Merrell
+    et al. 2007). Their pixels leave `unused`, so that each comes once."""
+    chosen = unused[one]
     world = torch.linalg.inv(views.world_to_camera[one])
     xyz = _rays(views, one)[chosen] / inverse[one][chosen][:, None] @ world[:3, :3].T + world[:3, 3]
     height, width = good.shape[1:]
-    pixels, same = [], []
-    for other in others.tolist():
+    same, through = xyz.new_zeros(2, len(xyz))
+    pixels = []
+    for other in range(len(good)):
         matrix = views.world_to_camera[other]
         seen = xyz @ matrix[:3, :3].T + matrix[:3, 3]
         x, y = ((seen @ views.intrinsics[other].T)[:, :2] / seen[:, 2:].clamp_min(1e-9)).floor().long().unbind(-1)
         inside = (seen[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
         x, y = x.clamp(0, width - 1), y.clamp(0, height - 1)
-        same.append(inside & good[other, y, x] & ((inverse[other, y, x] * seen[:, 2] - 1).abs() < WITHIN))
-        pixels.append((other, y, x))
-    kept = torch.stack(same).sum(dim=0) >= AGREEING if same else torch.zeros_like(xyz[:, 0], dtype=torch.bool)
-    for (other, y, x), agrees in zip(pixels, same, strict=True):
-        good[other, y[agrees & kept], x[agrees & kept]] = False
+        relative = inverse[other, y, x] * seen[:, 2]
+        known = inside & good[other, y, x] & (other != one)
+        same += known & ((relative - 1).abs() < WITHIN)
+        through += known & (relative < 1 - THROUGH)
+        if other in others.tolist():
+            pixels.append((other, y, x, known & unused[other, y, x] & ((relative - 1).abs() < WITHIN)))
+    agreeing = torch.stack([agrees for *_, agrees in pixels]).sum(dim=0) if pixels else torch.zeros_like(same)
+    kept = (agreeing >= AGREEING) & (through <= same)
+    for other, y, x, agrees in pixels:
+        unused[other, y[agrees & kept], x[agrees & kept]] = False
     return xyz[kept], views.rgb[one][chosen][kept]
 
 

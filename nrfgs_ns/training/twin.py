@@ -9,6 +9,7 @@ the training to go on; commands read the first.
 
 import functools
 import math
+import os
 from copy import copy, deepcopy
 from random import Random
 from typing import Any
@@ -39,10 +40,10 @@ NEIGHBOURS = 4
 """Training cameras that count as neighbours of one."""
 TURN = 3.0
 """Distances between neighbouring cameras that count as much as turning around by one radian."""
-PULLED = "means", "scales", "quats", "opacities", "features_dc"
+PULLED = "means", "scales", "quats", "opacities", "features_dc", *os.environ.get("TRIAL_PULLED", "").split()
 """Tensors that agreements change where the head has a network. The head's own tensors learn from photographs alone,
 since two networks would drift in colour together; harmonics do not (results/twin.json)."""
-JITTER = 0.25
+JITTER = float(os.environ.get("TRIAL_JITTER", "0.25"))
 """Standard deviation of a view's distance from the line between two cameras, in distances between neighbours."""
 
 Gradients = dict[Parameter, Tensor]
