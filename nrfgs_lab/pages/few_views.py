@@ -44,13 +44,19 @@ def twins(trial: str, base: str) -> list[list[dict]]:
     return [[one[seed], other[seed]] for one, other in pairs for seed in one if seed in other]
 
 
+def trial_gain(trial: str, base: str) -> str:
+    """Mean change of PSNR over sets of held-out views, with its standard error."""
+    gains = [one["measured"]["test"]["psnr"] - other["measured"]["test"]["psnr"] for one, other in twins(trial, base)]
+    return f"{signed(fmean(gains), 2)}±{stdev(gains) / len(gains) ** 0.5:.2f}"
+
+
 def twin_gain(trial: str, base: str) -> str:
     """Mean change by a twin over sets of held-out views, with its standard error, and how many sets gain."""
     tests = [[one["measured"]["test"] for one in pair] for pair in twins(trial, base)]
     psnr, ssim = ([one[metric] - other[metric] for one, other in tests] for metric in ("psnr", "ssim"))
     worst = [[min(view["psnr"] for view in test["per_image"]) for test in pair] for pair in tests]
     better = "{} and {} of {} sets".format(*(sum(one > 0 for one in gains) for gains in (psnr, ssim)), len(psnr))
-    gain = f"{signed(fmean(psnr), 2)}±{stdev(psnr) / len(psnr) ** 0.5:.2f} dB, {signed(fmean(ssim), 4)} SSIM"
+    gain = f"{trial_gain(trial, base)} dB, {signed(fmean(ssim), 4)} SSIM"
     return f"{gain} (better on {better}), {signed(fmean(one - other for one, other in worst), 1)} dB in the worst view"
 
 
@@ -66,9 +72,9 @@ def twin_tests(kind: str) -> str:
 
 
 def twin_cost(of: str) -> str:
-    """What a twin multiplies a training's seconds or peak memory by, in the median of pairs of one sitting each."""
-    pairs = [*twins("twin", "alone"), *twins("harmonics", "harmonics_alone")]
-    return f"{median(one['train'][of] / other['train'][of] for one, other in pairs):.1f}"
+    """What a twin multiplies a training's seconds or peak memory by, alone on a GPU: least and most."""
+    shares = [one["train"][of] / other["train"][of] for one, other in twins("nrfgs__twin", "nrfgs")]
+    return f"{min(shares):.1f} to {max(shares):.1f}"
 
 
 def ahead(gains: list[float], digits: int = 1) -> str:
@@ -193,6 +199,7 @@ BLOCKS = {
     "captures.rules_gain": rules_gain,
     "captures.twin": twin_gain,
     "captures.twin_tests": twin_tests,
+    "captures.trial": trial_gain,
     "captures.twin_cost": twin_cost,
     "captures.floaters": floaters,
     "captures.today": lambda *place: _run({of: mean(today(*place), of) for of in ("psnr", "ssim", "splats")}),
