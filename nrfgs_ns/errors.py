@@ -9,8 +9,8 @@ from typing import Any
 
 DEBUG = os.environ.get("NRFGS_DEBUG", "0") not in ("", "0")
 """NRFGS_DEBUG=1: such exceptions show their traceback."""
-LONGEST = 160
-"""Characters of a value in a message."""
+LONGEST, LONGEST_REASON = 160, 500
+"""Characters of a value in a message, and of what an exception says."""
 
 
 class ForTheUser(Exception if DEBUG else SystemExit):
@@ -29,10 +29,10 @@ class InputError(ForTheUser, ValueError):
     """
 
 
-def shown(value: Any) -> str:
+def shown(value: Any, longest: int = LONGEST) -> str:
     """A value from a file for a message: one printable line of bounded length."""
     text = value if isinstance(value, str) and value.isprintable() else ascii(value)
-    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]}...{text[-LONGEST // 2 :]}"
+    return text if len(text) <= longest else f"{text[: longest // 2]}...{text[-longest // 2 :]}"
 
 
 def require(holds: bool, option: str, value: Any, needed: str) -> None:
@@ -43,12 +43,15 @@ def require(holds: bool, option: str, value: Any, needed: str) -> None:
 
 @contextlib.contextmanager
 def refusing(finding: str, fix: str, *kinds: type[Exception]) -> Iterator[None]:
-    """Turn an exception of these kinds into InputError: the finding, what the exception says, and the fix."""
+    """Turn an exception of these kinds into InputError: the finding, what the exception says, and the fix. One that is
+    meant for the user already passes."""
     try:
         yield
+    except ForTheUser:
+        raise
     except kinds as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(":.")
-        raise InputError(f"{finding} ({shown(reason)}). {fix}") from error
+        raise InputError(f"{finding} ({shown(reason, LONGEST_REASON)}). {fix}") from error
 
 
 def mind_the_reader() -> None:

@@ -25,4 +25,5 @@ def few_threads(are_enough: bool = True) -> Iterator[None]:
 def draws_small(pipeline) -> bool:
     """Whether one thread is enough for a pipeline's pictures."""
     cameras = pipeline.datamanager.train_dataset.cameras
-    return pipeline.model.num_points + int((cameras.width * cameras.height).max()) < SMALL
+    pixels = int((cameras.width * cameras.height).max()) if len(cameras) else 0
+    return pipeline.model.num_points + pixels < SMALL

@@ -198,7 +198,7 @@ def applied_scale(meta: dict[str, Any], source: Path) -> float:
     """The scale that the poses already have."""
     scale = meta.get("applied_scale", 1.0)
     holds = 0 < number(scale) < math.inf
-    require(holds, f"{source}: applied_scale", shown(repr(scale)), "a positive number, or removed")
+    require(holds, f"{source}: applied_scale", shown(repr(scale)), "a positive number (or remove it)")
     return number(scale)
 
 

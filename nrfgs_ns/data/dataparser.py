@@ -165,7 +165,7 @@ class NrfgsDataParser(DataParser):
         scaled = config.auto_scale_poses and len(frames) > 1
         poses = checks.check_poses(frames, source, need_spread=scaled)
         orientation = meta.get("orientation_override", config.orientation_method)
-        needed = f"one of {', '.join(ORIENTATIONS)}, or removed"
+        needed = f"one of {', '.join(ORIENTATIONS)} (or remove it)"
         require(orientation in ORIENTATIONS, f"{source}: orientation_override", shown(repr(orientation)), needed)
         placed, transform, scale = place(poses, orientation, config.center_method, scaled, config.scale_factor)
         kind = CAMERA_MODEL_TO_TYPE[meta.get("camera_model", "OPENCV")]

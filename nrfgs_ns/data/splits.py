@@ -51,7 +51,7 @@ def split_by_rule(config: Any, images: list[Path], source: Path) -> Rows:
     if count == 1:
         train, evaluated = [0], []
     elif mode == "interior":
-        require(every >= 2, "--eval-interval", every, "2 or more with --eval-mode interior")
+        require(every >= 2, "--eval-interval", every, "2 or more with --eval-mode interior (or choose another mode)")
         evaluated = interior_test_images(count, every)
         train = np.setdiff1d(np.arange(count), evaluated)
     else:

@@ -72,7 +72,7 @@ def write(folder: Path, step: int, content: dict[str, Any], only_latest: bool = 
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Read a checkpoint into host memory; InputError where a byte is not as it was written."""
+    """Read a checkpoint into host memory; InputError where a byte is not as it was written, or it is gone."""
     allow_nerfstudio_checkpoints()
     # Damage to a zip archive, or to a pickle in it, can raise anything.
     with refusing(f"{path} is damaged", "Restore it from a copy, or take another one.", Exception):

@@ -75,7 +75,8 @@ class NrfgsTrainerConfig(TrainerConfig):
             name = "pipeline.datamanager.dataparser.mask_color"
             raise InputError(f"{name} is {color}; masked pixels are not trained on, whatever their colour. {fix}")
         order = data.train_cameras_sampling_strategy
-        require(order == "random", "pipeline.datamanager.train_cameras_sampling_strategy", order, "random")
+        name = "pipeline.datamanager.train_cameras_sampling_strategy"
+        require(order == "random", name, order, "random, as these methods draw cameras")
         lowest = {
             positive: ("time_budget", "schedule_steps", "pipeline.datamanager.camera_res_scale_factor"),
             0: ("max_num_iterations", "average_steps", "pipeline.datamanager.max_thread_workers", "machine.seed"),
@@ -165,7 +166,7 @@ class NrfgsTrainerConfig(TrainerConfig):
         data = self.pipeline.datamanager
         dataparser = replace(data.dataparser, data=_absolute(data.dataparser.data))
         pipeline = replace(self.pipeline, datamanager=replace(data, data=_absolute(data.data), dataparser=dataparser))
-        with refusing(f"{self.get_base_dir()} cannot be written", "Name another --output-dir.", OSError):
+        with refusing(f"--output-dir {self.output_dir} cannot be written", "Name another one.", OSError):
             self._take_a_folder()
             whole = replace(self, pipeline=pipeline, data=_absolute(self.data), output_dir=_absolute(self.output_dir))
             TrainerConfig.save_config(whole)
