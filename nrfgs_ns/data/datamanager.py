@@ -14,7 +14,7 @@ import numpy.typing as npt
 import psutil
 import torch
 import tyro
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.configs.dataparser_configs import all_dataparsers
 from nerfstudio.data.datamanagers.full_images_datamanager import (
     FullImageDatamanager,
@@ -28,7 +28,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 from torch import Tensor
 
-from nrfgs_ns.data.checks import some, warn
+from nrfgs_ns.data.checks import DRAWN, some, warn
 from nrfgs_ns.data.colmap_parser import checked
 from nrfgs_ns.data.dataparser import NrfgsDataParser, NrfgsDataParserConfig
 from nrfgs_ns.data.lenses import LENS, undistorted_cameras
@@ -57,6 +57,10 @@ class NrfgsInputDataset(InputDataset):
                 option = f"--pipeline.datamanager.camera-res-scale-factor {scale_factor}"
                 raise InputError(f"{option} leaves nothing of the images. Give a larger one.")
             setattr(self.cameras, name, sides.to(getattr(self.cameras, name)))
+        kinds = {CameraType(kind) for kind in self.cameras.camera_type.flatten().tolist()}
+        if other := some(sorted(kind.name for kind in kinds.difference(DRAWN))):
+            place = self.image_filenames[0].parent
+            raise InputError(f"{place}: cameras {other} cannot be trained on. Undistort the photographs to pinholes.")
         self.lenses = self.cameras
         """the cameras of the files; `cameras` are the pinholes of the images that `get_data` undistorts"""
         self.cameras = undistorted_cameras(self.lenses)

@@ -192,6 +192,14 @@ def test_data_of_another_kind_is_told(capture):
         NrfgsDatamanagerConfig(dataparser=parser).setup(device="cpu")
 
 
+@pytest.mark.parametrize("kind", [CameraType.FISHEYE624, CameraType.EQUIRECTANGULAR])
+def test_cameras_of_other_parsers_that_cannot_be_drawn_are_told(capture, kind):
+    outputs = capture.parse()
+    outputs.cameras.camera_type[1] = kind.value
+    with pytest.raises(InputError, match=f"{kind.name} cannot be trained on.*[Uu]ndistort"):
+        NrfgsInputDataset(outputs)
+
+
 @pytest.mark.parametrize("kind", [AttributeError, AssertionError, KeyError, TypeError])
 @pytest.mark.parametrize("place", ["dataparser.checks.check_options", "datamanager.different_views"])
 def test_mistakes_of_our_own_keep_their_traceback(capture, monkeypatch, place, kind):
