@@ -11,7 +11,7 @@ from itertools import product
 from statistics import median
 
 from nrfgs_lab.pages.few_views import FIELD, HALF, MADE, SAME, sparse_runs, today
-from nrfgs_lab.pages.files import CAPTURES, reports
+from nrfgs_lab.pages.files import reports
 from nrfgs_lab.pages.methods import COUNTS, CURVES, HEADS_OF, RULES_OF, SEATS_OF, Labels, equal
 from nrfgs_lab.pages.runs import ROOT, VIEWS, bench_rows, mean_of, records, signed, view_gains
 from nrfgs_ns.files import write_whole
@@ -144,7 +144,7 @@ def files() -> str:
     """What files of a model lose over their size: a line of fine-tunes for each capture, a square without one."""
     places = {
         scene: {name: (one["bytes"] / 1e6, -one["loss_db"]) for name, one in reports(scene).items() if "loss_db" in one}
-        for scene in CAPTURES
+        for scene in ("bonsai", "goldcape", "fox")
     }
     tuned = {scene: [p for name, p in of.items() if name.startswith("rate")] for scene, of in places.items()}
     ticks = {size: f"{size} MB" for size in (0.5, 1, 2, 4, 8)}
