@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import InputError, require
 
 if TYPE_CHECKING:  # the rasterizer imports this module
     from nrfgs_ns.rasterizer import View
@@ -76,8 +76,7 @@ class AppearanceHeadConfig:
 
     def require(self, holds: bool, name: str, needed: str) -> None:
         """Raise InputError naming field `name`, its value and what is `needed`, unless the condition holds."""
-        if not holds:
-            raise InputError(f"pipeline.model.appearance.{name} is {getattr(self, name)!r}; it must be {needed}.")
+        require(holds, f"pipeline.model.appearance.{name}", repr(getattr(self, name)), needed)
 
 
 class AppearanceHead(nn.Module, ABC):
@@ -264,7 +263,7 @@ def check_head(head: AppearanceHead, splats: Mapping[str, Tensor]) -> None:
     where = f"{type(head).__module__}.{type(head).__name__}"
     count = len(splats["means"])
 
-    def require(part: str, value: Tensor, *shape: int) -> None:
+    def check(part: str, value: Tensor, *shape: int) -> None:
         if value.dtype != torch.float32 or value.shape != shape or not value.isfinite().all():
             actual = f"{str(value.dtype).removeprefix('torch.')} {[*value.shape]}"
             actual += "" if value.isfinite().all() else ", not all finite"
@@ -273,7 +272,7 @@ def check_head(head: AppearanceHead, splats: Mapping[str, Tensor]) -> None:
     if not isinstance(getattr(head, "name", None), str):
         raise InputError(f'{where} has no name, which checkpoints need. Give the class one, such as name = "mine".')
     for name, value in splats.items():
-        require(f"{name!r} of splat_params", value, count, *value.shape[1:])
+        check(f"{name!r} of splat_params", value, count, *value.shape[1:])
     if count == 0:
         return
     table = {name: value[:1].expand(count + 2, *value.shape[1:]).contiguous() for name, value in splats.items()}
@@ -281,12 +280,12 @@ def check_head(head: AppearanceHead, splats: Mapping[str, Tensor]) -> None:
     if not isinstance(result, SplatAppearance):
         kind = type(result).__name__
         raise InputError(f"{where}: forward returns a {kind}. Let it return SplatAppearance(colors, opacities).")
-    require("opacities of forward, for two splats,", result.opacities, 2)
-    require("colors of forward, for two splats,", result.colors, 2, result.colors.shape[-1] if head.at_pixel else 3)
+    check("opacities of forward, for two splats,", result.opacities, 2)
+    check("colors of forward, for two splats,", result.colors, 2, result.colors.shape[-1] if head.at_pixel else 3)
     if head.at_pixel:
         features = result.colors[0].repeat(16, 16, 1)
         rays = torch.tensor([0.0, 0.0, 1.0]).repeat(16, 16, 1)
-        require("what image_of makes of 16 x 16 pixels", head.image_of(features, rays), 16, 16, 3)
+        check("what image_of makes of 16 x 16 pixels", head.image_of(features, rays), 16, 16, 3)
 
 
 def layers(*widths: int) -> list[nn.Module]:

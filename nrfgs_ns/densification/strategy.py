@@ -18,7 +18,7 @@ from torch.optim import Optimizer
 
 from nrfgs_ns.data.checks import warn
 from nrfgs_ns.densification import memory
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import require
 
 OpacitySeen = Literal["base", "peak"]
 """Opacity of a splat that decides what becomes of it: the stored one, or the largest that a view has shown lately."""
@@ -110,9 +110,7 @@ class DensificationConfig(ABC):
 
     def require(self, holds: bool, name: str, needed: str) -> None:
         """Raise InputError naming option `name`, its value and what is `needed`, unless the condition holds."""
-        if not holds:
-            option = f"--pipeline.model.densification {self.name}: {name}"
-            raise InputError(f"{option} is {getattr(self, name)}; it must be {needed}.")
+        require(holds, f"--pipeline.model.densification {self.name}: {name}", getattr(self, name), needed)
 
     def share_of(self, rank: int, devices: int) -> "DensificationConfig":
         """The options for one of several devices, each of which has a part of the splats."""

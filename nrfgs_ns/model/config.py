@@ -13,7 +13,7 @@ from nerfstudio.models.base_model import ModelConfig
 from nrfgs_ns.appearance.head import AppearanceHeadConfig
 from nrfgs_ns.appearance.nrf import NrfConfig
 from nrfgs_ns.densification import DensificationChoice, Splatfacto
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import require
 
 PRIOR_VIEWS = 20
 """Training views with which the trust in the head, by `few_views`, is one half."""
@@ -86,8 +86,7 @@ class NrfgsModelConfig(ModelConfig):
         ):
             for name in names.split():
                 value = getattr(self, name)
-                if value is not None and not low <= value < high:
-                    raise InputError(f"pipeline.model.{name} is {value}; it must be {needed}.")
+                require(value is None or low <= value < high, f"pipeline.model.{name}", value, needed)
 
     def trust(self, views: int) -> float:
         """Trust in the head with this number of training views, in (0, 1]."""
