@@ -194,6 +194,8 @@ def dense_points(
             planes = inverse_depths(views, one, compared[one], 0.8 * near, 1.5 * far)
             inverse[one], correlation = sweep(views, grey, one, compared[one], planes)
             good[one] = correlation > MIN_CORRELATION
+    maps = [_same(views, inverse, good, one, others) for one, others in enumerate(compared)]
+    dense_points.maps = views, inverse, torch.stack(maps)
     found = [_agreed(views, inverse, good, one, others) for one, others in enumerate(compared)]
     xyz, rgb = (torch.cat(tables) for tables in zip(*found, strict=True))
     drawn = torch.rand(len(xyz), generator=torch.Generator().manual_seed(0)).to(xyz.device) < share
@@ -219,6 +221,25 @@ def _agreed(views: Views, inverse: Tensor, good: Tensor, one: int, others: Tenso
     for (other, y, x), agrees in zip(pixels, same, strict=True):
         good[other, y[agrees & kept], x[agrees & kept]] = False
     return xyz[kept], views.rgb[one][chosen][kept]
+
+
+def _same(views, inverse, good, one, others):
+    """Where AGREEING others have the depth that a view has, bool [H, W]."""
+    chosen = good[one]
+    world = torch.linalg.inv(views.world_to_camera[one])
+    xyz = _rays(views, one)[chosen] / inverse[one][chosen][:, None] @ world[:3, :3].T + world[:3, 3]
+    height, width = good.shape[1:]
+    count = torch.zeros(len(xyz), dtype=torch.int, device=xyz.device)
+    for other in others.tolist():
+        matrix = views.world_to_camera[other]
+        seen = xyz @ matrix[:3, :3].T + matrix[:3, 3]
+        x, y = ((seen @ views.intrinsics[other].T)[:, :2] / seen[:, 2:].clamp_min(1e-9)).floor().long().unbind(-1)
+        inside = (seen[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
+        x, y = x.clamp(0, width - 1), y.clamp(0, height - 1)
+        count += inside & good[other, y, x] & ((inverse[other, y, x] * seen[:, 2] - 1).abs() < WITHIN)
+    result = torch.zeros_like(chosen)
+    result[chosen] = count >= AGREEING
+    return result
 
 
 def _rays(views: Views, one: int) -> Tensor:

@@ -40,6 +40,8 @@ class NrfgsModelConfig(ModelConfig):
     twin: Literal["auto", "on", "off"] = "off"
     """train a second model beside the first, with which it must agree between the cameras. auto: on one GPU, where
     views are few (docs/captures.md)"""
+    depth: str = ""
+    """weight,every,shape,until: trial of depths from photographs"""
     near_plane: Literal["auto", "off"] = "off"
     """auto: draw nothing nearer than half the depth of the capture's nearest points (docs/captures.md). off: nothing
     nearer than 0.01 scene units, as in splatfacto"""

@@ -79,4 +79,5 @@ def start_with_dense_points(model: Any, datamanager: Any) -> None:
     views = small_views((batch["image"] for batch in images), masks, intrinsics, poses)
     progress = partial(track, description="Points from photographs", console=CONSOLE, transient=True)
     xyz, rgb = dense_points(views, positions.to(poses), share, progress)
+    model.depth_maps = dense_points.maps
     model.start_from((torch.cat([positions, xyz.to(positions)]), torch.cat([colors, (255 * rgb).to(colors)])))

@@ -35,6 +35,7 @@ from nrfgs_ns.training.progress import ProgressLine, ProgressLineConfig, end_ear
 from nrfgs_ns.training.step_graph import StepGraphs
 from nrfgs_ns.training.stopping import StopRequest, heard_signals, is_out_of_memory, rows_agree
 from nrfgs_ns.training.trainer_config import NrfgsTrainerConfig, report_choices
+from nrfgs_ns.training.depths import depth_pull
 from nrfgs_ns.training.twin import Twin, twin_of
 
 NOTHING_TO_SAVE = "Stopped before the first step; there is nothing to save."
@@ -215,6 +216,11 @@ class NrfgsTrainer(Trainer):
         with self._last_good_state_on_disk():
             pulled = {} if self.twin is None else self.twin.make_step(step)
             is_logged = step % self.config.logging.steps_per_log == 0
+            if model.config.depth:
+                for key, value in depth_pull(self, getattr(model, "depth_maps", None), step).items():
+                    pulled[key] = pulled[key] + value if key in pulled else value
+                if step % 500 == 0 and hasattr(self, "depth_loss"):
+                    print("depth", step, float(self.depth_loss), flush=True)
             loss, losses, metrics = descend(self, step, pulled, is_logged)
             optimizers.scheduler_step_all(step)
         self._completed_step = step

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from nrfgs_ns.data.views import camera_spacing
 from nrfgs_ns.model.loss import loss_of
+from nrfgs_ns.training.depths import depth_pull
 from nrfgs_ns.training.guard import Guard
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
 from nrfgs_ns.training.pipeline import Gradients, descend
@@ -125,6 +126,9 @@ class Twin:
             view = self.between.draw(Random(f"{first._seed} {step}"))
             pictures = [picture(each, view, step) for each in (self, self.trainer)]
             pulls = [pull(each, view, seen, step) for each, seen in zip((self.trainer, self), pictures, strict=True)]
+        if model.config.depth:
+            for key, value in depth_pull(self, getattr(first, "depth_maps", None), step).items():
+                pulls[1][key] = pulls[1][key] + value if key in pulls[1] else value
         for name, optimizer in self.optimizers.optimizers.items():
             optimizer.param_groups[0]["lr"] = self.trainer.optimizers.optimizers[name].param_groups[0]["lr"]
         descend(self, step, pulls[1])
