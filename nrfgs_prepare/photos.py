@@ -119,6 +119,8 @@ def _store(image: Image.Image, path: Path, target: Path) -> None:
     if upright and image.mode in ("RGB", "L") and image.format in KEPT.get(path.suffix.lower(), ()):
         shutil.copyfile(path, target)
         return
+    for name in ("exif", "Raw profile type exif"):  # PIL would write it anew, which tags of other types prevent
+        image.info.pop(name, None)
     turned = ImageOps.exif_transpose(image)
     if turned.mode in ("RGBA", "LA", "PA") or "transparency" in turned.info:  # put a cut-out object on white
         turned = Image.alpha_composite(Image.new("RGBA", turned.size, "white"), turned.convert("RGBA"))
@@ -132,7 +134,10 @@ def exif_of_copy(exif: Image.Exif) -> bytes:
     copy.update({tag: exif[tag] for tag in KEPT_TAGS if tag in exif})
     copy.get_ifd(ExifTags.IFD.Exif).update({tag: details[tag] for tag in KEPT_DETAILS if tag in details})
     copy.get_ifd(ExifTags.IFD.GPSInfo).update(exif.get_ifd(ExifTags.IFD.GPSInfo))
-    return copy.tobytes()
+    try:
+        return copy.tobytes()
+    except Exception:  # tags of other types
+        return b""
 
 
 def same_cameras(folder: Path, names: list[str]) -> list[list[str]]:

@@ -53,6 +53,9 @@ def _file(folder: Path, stem: str) -> Path:
     for path in (folder / f"{stem}.bin", folder / f"{stem}.txt"):
         if path.is_file():
             return path
+    if stem == "points3D":
+        fix = "Copy it there, or start from random points with --load-3D-points False."
+        raise InputError(f"{folder} holds neither {stem}.bin nor {stem}.txt. {fix}")
     root = next((parent for parent in folder.parents if parent.is_dir()), folder)
     place = find_colmap(root)
     where = f"There is a COLMAP model in {root / place}: give" if place else "Name the folder of the COLMAP model with"
@@ -90,7 +93,9 @@ def _images_text(path: Path) -> list[dict[str, Any]]:
         if line.strip() and not line.lstrip().startswith("#"):
             id, *pose, camera, name = line.split(maxsplit=9)
             frames.append(_frame(int(id), pose, int(camera), name.strip()))
-            next(lines, None)  # features
+            features = next(lines, "").split()  # x, y and the point's number of each; the line may be empty
+            if len(features) % 3 or not all(number.lstrip("-").isdigit() for number in features[2::3]):
+                raise ValueError(f"the line after {name.strip()} is not of features: each image has two lines")
     return frames
 
 

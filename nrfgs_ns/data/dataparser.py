@@ -26,7 +26,7 @@ from nrfgs_ns.data import checks
 from nrfgs_ns.data.checks import PIXELS, SMALLEST, find_colmap, warn
 from nrfgs_ns.data.colmap import read_points
 from nrfgs_ns.data.lenses import check_distortions
-from nrfgs_ns.data.pictures import known_exif, read_size
+from nrfgs_ns.data.pictures import known_exif, read_exif, read_size
 from nrfgs_ns.data.points import check_sight, finite, in_reach, read_ply
 from nrfgs_ns.data.splits import SPLITS, STAND_INS, Named, Rows, split_by_names, split_by_rule
 from nrfgs_ns.errors import InputError, refusing, require, shown
@@ -112,6 +112,8 @@ class NrfgsDataParser(DataParser):
         images, masks = (self._files(frames, key, data_set.factor) for key in FOLDERS)
         cameras = data_set.cameras[torch.from_numpy(rows)]
         copies = all(self._has_copies(key, data_set.factor) for key in FOLDERS if key in frames[0])
+        # Smaller copies have often lost it.
+        full_size_exif = lambda frame: read_exif(self._path(frame["file_path"])) if copies else {}  # noqa: E731
         corner = torch.full((3,), self.config.scene_scale)
         outputs = PlacedOutputs(
             image_filenames=images,
@@ -121,7 +123,7 @@ class NrfgsDataParser(DataParser):
             dataparser_scale=data_set.scale,
             dataparser_transform=data_set.from_original,
             metadata={
-                "exif": [known_exif(frame.get("exif", {})) for frame in frames],
+                "exif": [known_exif(frame.get("exif")) or full_size_exif(frame) for frame in frames],
                 "factor": data_set.factor,
                 "downscale": 1 if copies else data_set.factor,
             },
@@ -200,6 +202,8 @@ class NrfgsDataParser(DataParser):
         if named and "train" not in named:
             given, _ = next(iter(named.values()))  # such as test_filenames or test_list.txt
             raise InputError(f"{source} has {given}, but no train_{given.partition('_')[2]}. Name the training images.")
+        if named and (rule := self.config.eval_mode) != NrfgsDataParserConfig.eval_mode:
+            warn(f"{source} names its test images, so --eval-mode {rule} changes nothing. Remove the lists for it.")
         splits = (
             split_by_names(named, paths, self._path, source) if named else split_by_rule(self.config, paths, source)
         )
@@ -220,7 +224,7 @@ class NrfgsDataParser(DataParser):
     def _copies(self, key: str, factor: int) -> Path:
         """Folder of the copies at 1 / factor of the size, which need not be there."""
         root = self._root(key)
-        return root.with_name(f"{root.name}_{factor}")
+        return root.parent / f"{root.name}_{factor}"
 
     def _check_sizes(self, meta: dict[str, Any], source: Path, factor: int, full: Tensor, small: Tensor) -> None:
         """Check that images and masks have the size of their cameras, or the full one without smaller copies, [V, 2]
@@ -304,7 +308,7 @@ def place(
         The poses, float32 [V, 3, 4]; the transform [3, 4] before scaling, float64 if they were far from the origin and
         otherwise float32; and the scale.
     """
-    if len(poses) == 1 and orientation == "vertical":  # needs two cameras
+    if len(poses) < 3 and orientation == "vertical":  # needs three cameras
         orientation = "up"
     positions = poses[:, :3, 3]
     center = positions.mean(axis=0)
@@ -313,11 +317,12 @@ def place(
     offset = rounded(center, extent) if far else np.zeros(3)
     near = poses.copy()
     near[:, :3, 3] -= offset
-    placed, transform = auto_orient_and_center_poses(
-        torch.from_numpy(near.astype(np.float32)), method=orientation, center_method=centering
-    )
+    moved = torch.from_numpy(near.astype(np.float32))
+    with refusing("The cameras cannot be placed", "Give the parser --center-method poses.", RuntimeError):
+        _, transform = auto_orient_and_center_poses(moved, method=orientation, center_method=centering)
     if not torch.isfinite(transform).all():
         raise InputError("The poses' up directions cancel. Give the parser --orientation-method none, or other poses.")
+    placed = transform @ moved  # with pca nerfstudio turns the second and the third camera in place of two axes
     reach = float(torch.max(torch.abs(placed[:, :3, 3])))
     scale = (1.0 / reach if auto_scale and reach > 0 else 1.0) * factor
     placed[:, :3, 3] *= scale

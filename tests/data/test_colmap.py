@@ -106,6 +106,9 @@ def test_names_with_spaces_and_images_without_features(tmp_path):
     lines = file.read_text().replace("003.png", "a b.png").splitlines()
     file.write_text("\n".join(line if line.endswith("png") or line[0] == "#" else "" for line in lines) + "\n")
     assert "a b.png" in [path.name for path in parse(scene).image_filenames]
+    file.write_text("\n".join(line for line in lines if line.endswith("png")))
+    with pytest.raises(InputError, match="each image has two lines"):
+        parse(scene)
 
 
 def test_real_model(captures):

@@ -65,6 +65,7 @@ def test_val_and_test_stand_in_for_each_other_and_train_for_both(capture, printe
     assert names(capture.parse("train")) == list(range(7))
     assert names(capture.parse("val")) == names(capture.parse("test")) == [7, 8, 9]
     assert "evaluated instead" not in printed()
+    assert len(names(capture.parse(eval_mode="all"))) == 7 and "--eval-mode all changes nothing" in printed()
     capture.meta |= {"train_filenames": path[:4], "val_filenames": [], "test_filenames": []}
     assert names(capture.parse("test")) == [6, 7, 8, 9]
     assert "no image is kept for test" in printed()

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from small_capture import Capture
 
 from nrfgs_ns.data.datamanager import NrfgsDatamanagerConfig
+from nrfgs_ns.data.dataparser import place
 from nrfgs_ns.errors import InputError
 from nrfgs_ns.export.frames import to_capture
 
@@ -46,6 +47,15 @@ def test_coordinates_of_the_earth_lose_nothing(tmp_path, orientation, center):
     np.testing.assert_allclose(back.places(far.metadata["points3D_xyz"]) + origin, xyz, atol=1e-5, rtol=0)
     assert np.abs(origin - UTM - (5, 6, 7)).max() < 4 and (origin == np.round(origin)).all()
     assert (to_capture(near)[1] == 0).all()
+
+
+def test_poses_are_where_the_transform_leads():
+    """With pca nerfstudio also mirrors the second and the third camera, as here."""
+    poses = np.tile(np.eye(4), (8, 1, 1))
+    poses[:, :3, :3] = Rotation.random(8, random_state=0).as_matrix()
+    poses[:, :3, 3] = np.random.default_rng(0).normal(size=(8, 3))
+    placed, transform, scale = place(poses, "pca", "poses", True, 1.0)
+    np.testing.assert_allclose(placed, transform.double().numpy() @ poses * [1, 1, 1, scale], atol=1e-5)
 
 
 def test_an_applied_transform_is_part_of_the_way_back(tmp_path):

@@ -77,8 +77,7 @@ def test_positions_are_laid_out_in_metres(tmp_path):
     place = np.array([55 + 41 / 60 + 53.4 / 3600, 13 + 11 / 60 + 43.4 / 3600])
     np.testing.assert_allclose(structure.positions(database, list(tags)), [place, -place, [np.nan] * 2, [np.nan] * 2])
 
-    unknown = (np.nan, np.nan)
-    laid = pairs.metres(np.array([(60.0, 10.0), unknown, (60.001, 10.0), (60.0, 10.002)]))
+    laid = pairs.metres(np.array([(60.0, 10.0), (np.nan, np.nan), (60.001, 10.0), (60.0, 10.002)]))
     assert np.isnan(laid[1]).all()
     # A degree is 111.2 km, and half of it to the east at 60 degrees north.
     assert np.linalg.norm(laid[0] - laid[2]) == pytest.approx(111.2, abs=0.1)

@@ -5,6 +5,7 @@ import io
 import json
 import math
 import shutil
+import struct
 import sys
 from pathlib import Path
 from unittest.mock import DEFAULT, Mock
@@ -338,10 +339,13 @@ def test_photographs_are_kept_or_made_upright(tmp_path):
     plain, turned = photo(tmp_path / "a b.JPG"), photo(tmp_path / "c.jpg", (40, 30), exif=exif)
     Image.new("RGBA", (40, 30), (255, 0, 0, 0)).save(tmp_path / "d.png")
     renamed, done = photo(tmp_path / "f.jpg", format="WEBP"), []
-    paths = [plain, turned, tmp_path / "d.png", photo(tmp_path / "e.bmp"), renamed]
+    entries = struct.pack("<HHIIHHIII", 0x112, 3, 1, 6, 0x131, 5, 1, 38, 0)  # orientation, and software as a fraction
+    odd = b"Exif\0\0II*\0" + struct.pack("<IH", 8, 2) + entries + struct.pack("<II", 1, 1)
+    strange = photo(tmp_path / "g.jpg", (40, 30), exif=odd)
+    paths = [plain, turned, tmp_path / "d.png", photo(tmp_path / "e.bmp"), renamed, strange]
     photos.import_photos(paths, tmp_path / "stored" / "photos", done.append)
     stored = {path.name: path for path in (tmp_path / "stored" / "photos").iterdir()}
-    assert set(stored) == {"a_b.jpg", "c.jpg", "d.png", "e.png", "f.jpg"} and len(done) == 5
+    assert set(stored) == {"a_b.jpg", "c.jpg", "d.png", "e.png", "f.jpg", "g.jpg"} and len(done) == 6
     assert stored["a_b.jpg"].read_bytes() == plain.read_bytes(), "not encoded a second time"
     with Image.open(stored["c.jpg"]) as image:
         assert image.size == (30, 40) and image.getexif().get(ExifTags.Base.Orientation, 1) == 1
