@@ -11,6 +11,7 @@ from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import remove, reset_opa
 from torch import Tensor
 
+from nrfgs_ns.data.checks import warn
 from nrfgs_ns.densification.statistics import Statistics, accumulate
 from nrfgs_ns.densification.strategy import Densification, DensificationConfig
 
@@ -117,7 +118,11 @@ class GradientDensification(Densification):
         return step >= self.strategy.refine_stop_iter
 
     def begin(self, centers: Tensor, num_splats: int, pixels: int) -> None:
-        self.pixels = pixels
+        super().begin(centers, num_splats, pixels)
+        rules = self.strategy
+        if self.verbose and rules.pause_refine_after_reset > rules.reset_every - rules.refine_every:
+            pause = f"each reset of opacities pauses it for {rules.pause_refine_after_reset} steps, until the next"
+            warn(f"{self.name} never refines: {pause}. Give more reset_alpha_every.")
 
     def change_splats(self, step, info, splats, optimizers) -> None:
         strategy = self.strategy

@@ -24,7 +24,7 @@ from nrfgs_ns.appearance.head import AppearanceHeadConfig, Field, SplatAppearanc
 from nrfgs_ns.data.checks import warn
 from nrfgs_ns.data.views import camera_spacing
 from nrfgs_ns.densification import Densification
-from nrfgs_ns.errors import InputError
+from nrfgs_ns.errors import InputError, require
 from nrfgs_ns.image import robust
 from nrfgs_ns.image.metrics import image_metrics
 from nrfgs_ns.image.photograph import PhotographModel
@@ -296,6 +296,9 @@ class NrfgsModel(ExportedModel):
     def get_training_callbacks(self, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
         cameras = attributes.pipeline.datamanager.train_dataset.cameras
         centers = cameras.camera_to_worlds[:, :3, 3]
+        smallest, halvings = int(min(cameras.width.min(), cameras.height.min())), self.config.num_downscales
+        left = f"so many that 2 of the smallest image's {smallest} pixels are left"
+        require(smallest >> halvings > 1, "pipeline.model.num_downscales", halvings, left)
         self.densification.begin(centers, self.num_points, int((cameras.width * cameras.height).max()))
         self.view_noise = ViewNoise(self.noise_factor * camera_spacing(centers), self.view_noise.seed)
 

@@ -140,6 +140,7 @@ class NrfgsTrainer(Trainer):
         left = config.max_num_iterations - self._start_step
         if config.time_budget is None and left <= 0:
             schedules = "" if config.schedule_steps is None else f" --schedule-steps {config.schedule_steps}"
+            schedules += f" --average-steps {config.average_steps}" if config.average_steps else ""
             longer = f"--max-num-iterations {2 * self._start_step}{schedules} makes as many more"
             raise InputError(f"{path} is the end of a training of {self._start_step:,} steps: {longer}.")
         self.optimizers.load_optimizers(content["optimizers"], list(self.pipeline.model.head.parameters()))
@@ -152,8 +153,9 @@ class NrfgsTrainer(Trainer):
             self.pipeline.model.schedule_at(int(self.pace.position))
         if self.mean is not None and self.world_size == 1 and "parameter_mean" in training:
             self.mean.load_state(training["parameter_mean"], self.optimizers.optimizers)
-        if self.twin is not None and "twin" not in training:
-            warn("The checkpoint is of a training without a twin, which goes on without one.")
+        if (self.twin is not None) != ("twin" in training):
+            whose = "training" if self.twin is None else "checkpoint"
+            warn(f"The {whose} has no twin (--pipeline.model.twin): the training goes on without one.")
             self.twin = None
         elif self.twin is not None:
             self.twin.load_state(training["twin"])

@@ -44,8 +44,8 @@ class NrfgsTrainerConfig(TrainerConfig):
     time_budget: float | None = None
     """minutes for all steps; schedules are stretched to the steps that fit"""
     schedule_steps: int | None = None
-    """steps for which schedules are given; they are stretched to the actual steps. None: max_num_iterations with a time
-    budget, otherwise not stretched"""
+    """steps for which schedules are given; they are stretched to the actual steps. None: 30,000 if max_num_iterations
+    is 0; otherwise max_num_iterations with a time budget, and not stretched without"""
     average_steps: int | None = None
     """last steps to average parameters over, at most a fiftieth of all. None: 200 if max_num_iterations is 0, else 0"""
 

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from nrfgs_ns.data.views import camera_spacing
+from nrfgs_ns.errors import InputError
 from nrfgs_ns.model.loss import loss_of
 from nrfgs_ns.training.guard import Guard
 from nrfgs_ns.training.optimizers import LeanOptimizers, parameters_of
@@ -149,8 +150,12 @@ def twin_of(trainer) -> Twin | None:
     """The twin that a trainer's configuration asks for (`NrfgsModelConfig.twin`), if any."""
     model, config = trainer.pipeline.model, trainer.config
     every = min(round(EVERY * math.exp(min(model.num_views / VIEWS, 2.0) ** 2)), RAREST)
-    is_long = config.time_budget is None and (config.schedule_steps or config.max_num_iterations) > START
-    suits = every < RAREST and is_long and model.device.type == "cuda" and model.camera_optimizer.config.mode == "off"
+    agrees, is_timed = (config.schedule_steps or config.max_num_iterations) > START, config.time_budget is not None
+    if model.config.twin == "on" and not agrees and not is_timed:
+        fix = "Give --schedule-steps 30000, or leave it off."
+        raise InputError(f"pipeline.model.twin is on, but trainings agree from step {START} of their schedules. {fix}")
+    is_fixed = model.camera_optimizer.config.mode == "off"
+    suits = every < RAREST and agrees and not is_timed and is_fixed and model.device.type == "cuda"
     is_wanted = model.config.twin == "on" or model.config.twin == "auto" and suits
     return Twin(trainer, every) if is_wanted else None
 

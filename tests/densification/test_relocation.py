@@ -78,8 +78,7 @@ def test_relocated_splats_become_copies_of_live_ones():
 def test_extremes():
     table = Table(5)
     before = table.splats["latents"].detach().clone()
-    source = relocate(table.splats, table.optimizers, torch.ones(5, dtype=torch.bool))
-    assert torch.equal(source, torch.arange(5))
+    assert torch.equal(relocate(table.splats, table.optimizers, torch.ones(5, dtype=torch.bool)), torch.arange(5))
     assert torch.equal(table.splats["latents"].detach(), before)
     one, many = (split_evenly(torch.tensor([0.5]), torch.ones(1, 3), torch.tensor([count])) for count in (51, 1000))
     assert torch.equal(one[0], many[0]) and torch.equal(one[1], many[1])

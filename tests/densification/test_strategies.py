@@ -84,6 +84,12 @@ def test_original_grows_above_its_gradient(gradient, count):
     assert len(table) == count
 
 
+def test_rules_that_never_refine_are_told(capsys):
+    for views in (100, 101):
+        Splatfacto(reset_alpha_every=3).build(views, views, 1.0).begin(torch.zeros(2, 3), 5, 100)
+    assert capsys.readouterr().out.count("splatfacto never refines") == 1
+
+
 def test_original_keeps_its_calendar():
     for step, left in ((REFINES, 10), (3100, 9)):
         table = Table(10)

@@ -167,10 +167,12 @@ def test_a_full_disk_is_survived_until_the_end(tiny_scene, tmp_path, monkeypatch
 
 def test_a_finished_training_says_so_and_how_to_extend_it(finished, tiny_scene, tmp_path):
     folder = models_of(finished)
-    with pytest.raises(InputError, match="is the end of a training of 12 steps: --max-num-iterations 24 makes"):
+    with pytest.raises(InputError, match="training of 12 steps: --max-num-iterations 24 --average-steps 4 makes"):
         ready(tiny_scene, tmp_path / "b", {"--load-dir": folder}, steps=STEPS - 1)
     with pytest.raises(InputError, match="Schedules of 5 steps end before step 12. Give"):
         ready(tiny_scene, tmp_path / "b", {"--load-dir": folder, "--schedule-steps": 5}, steps=STEPS + 2)
+    with pytest.raises(InputError, match="num_downscales is 6; it must be so many that 2"):
+        ready(tiny_scene, tmp_path / "b", {"--pipeline.model.num-downscales": 6})
     longer = ready(tiny_scene, tmp_path / "c", {"--load-dir": folder}, steps=STEPS + 2)
     assert writer.GLOBAL_BUFFER["max_iter"] == STEPS + 2
     longer.train()

@@ -196,8 +196,7 @@ def test_on_a_gpu(start, name, value):
     ((step, state),) = checkpoints(trainer).items()
     after = {path: tensor.cpu() for path, tensor in numbers(state).items()}
     assert step == 3 and after.keys() == before.keys()
-    changed = [path for path in before if "_extra_state" not in path and not torch.equal(after[path], before[path])]
-    assert changed == []
+    assert [path for path in before if "_extra_state" not in path and not torch.equal(after[path], before[path])] == []
     start({"--load-dir": trainer.checkpoint_dir}).train()
 
 

@@ -121,8 +121,7 @@ def test_resumed_training_is_the_unbroken_one(method, finished, tiny_scene, tmp_
     """From the checkpoint in the middle. In both parts splats are split (with random samples), pruned and their Adam
     state carried along; the second resets opacities."""
     folder = models_of(finished(method))
-    load = {"--load-dir": folder, "--load-step": HALF}
-    rest = checkpoint_of(trained(options(tiny_scene, tmp_path, method, load)))
+    rest = checkpoint_of(trained(options(tiny_scene, tmp_path, method, {"--load-dir": folder, "--load-step": HALF})))
     whole, half = (read_latest(folder, step)[1] for step in (STEPS - 1, HALF))
     counts = [len(part["pipeline"]["_model.gauss_params.means"]) for part in (half, whole)]
     assert counts[0] != counts[1], "nothing was densified in the second part: the test would prove nothing"

@@ -10,6 +10,7 @@ from nerfstudio.cameras.cameras import Cameras
 from short_trainings import REFINING, assert_same_training, checkpoint_of, command_line, models_of, set_up, trained
 from torch.testing import assert_close
 
+from nrfgs_ns.errors import InputError
 from nrfgs_ns.image.ssim import photometric_loss
 from nrfgs_ns.training import twin
 from nrfgs_ns.training.checkpoint_files import read_latest
@@ -17,7 +18,7 @@ from nrfgs_ns.training.guard import TrainingStopped
 from nrfgs_ns.training.pipeline import descend
 from nrfgs_ns.training.twin import picture, pull
 
-BESIDE = {"--pipeline.model.twin": "on", **REFINING}
+BESIDE, ALONE = {"--pipeline.model.twin": "on", **REFINING}, {"--pipeline.model.twin": "off"}
 
 
 @pytest.fixture(autouse=True)
@@ -46,11 +47,14 @@ def test_a_training_with_a_twin_goes_on_from_its_checkpoint(method, tiny_scene, 
 
 
 def test_a_checkpoint_without_a_twin_goes_on_alone(tiny_scene, tmp_path, no_cuda, capsys):
-    alone = trained(command_line("nrfgs", tiny_scene, tmp_path / "alone", 4, BESIDE, {"--pipeline.model.twin": "off"}))
+    alone = trained(command_line("nrfgs", tiny_scene, tmp_path / "alone", 4, BESIDE, ALONE))
     assert "twin" not in checkpoint_of(alone)["training"]
     trainer = set_up(command_line("nrfgs", tiny_scene, tmp_path / "more", 6, BESIDE, {"--load-dir": models_of(alone)}))
     assert trainer.twin is None and trainer.pipeline.model.densification.trainings == 1
     assert "goes on without one" in capsys.readouterr().out
+    both = trained(command_line("nrfgs", tiny_scene, tmp_path / "both", 4, BESIDE))
+    set_up(command_line("nrfgs", tiny_scene, tmp_path, 6, BESIDE, {"--load-dir": models_of(both), **ALONE}))
+    assert "The training has no twin" in capsys.readouterr().out
 
 
 def test_a_checkpoint_is_of_a_twin_of_finite_numbers(tiny_scene, tmp_path, no_cuda):
@@ -73,7 +77,11 @@ def test_few_views_on_a_gpu_have_a_twin(views, device, changed, every, monkeypat
     options = SimpleNamespace(twin=changed.pop("twin", "auto"))
     model = SimpleNamespace(num_views=views, device=torch.device(device), camera_optimizer=still, config=options)
     config = SimpleNamespace(**{"time_budget": None, "schedule_steps": 30_000, "max_num_iterations": 10_000, **changed})
-    assert twin.twin_of(SimpleNamespace(pipeline=SimpleNamespace(model=model), config=config)) == every
+    trainer = SimpleNamespace(pipeline=SimpleNamespace(model=model), config=config)
+    assert twin.twin_of(trainer) == every
+    model.config.twin, config.time_budget, config.schedule_steps = "on", None, 3000
+    with pytest.raises(InputError, match="from step 6000"):
+        twin.twin_of(trainer)
 
 
 def test_views_lie_between_neighbouring_cameras(tiny_scene, tmp_path, no_cuda, monkeypatch):
@@ -119,8 +127,7 @@ def test_a_pull_is_the_gradient_of_the_loss_against_the_others_picture(tiny_scen
     parameter = model.gauss_params["features_dc"]
     start, gradient = parameter.data.clone(), gradients[parameter]
     step = 1e-3 * gradient / gradient.norm()
-    slope = (loss(start + step) - loss(start - step)) / (2e-3)
-    assert slope == pytest.approx(gradient.norm().item(), rel=0.05)
+    assert (loss(start + step) - loss(start - step)) / 2e-3 == pytest.approx(gradient.norm().item(), rel=0.05)
 
 
 def test_densification_looks_at_photographs_alone(tiny_scene, tmp_path, no_cuda):
