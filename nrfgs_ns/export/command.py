@@ -107,12 +107,18 @@ class Web(Compact):
         """Whether the page is one file with the scene in it."""
         return self.output.suffix.lower() in (".html", ".htm")
 
+    @property
+    def picture(self) -> Path:
+        """The picture that `address` asks for."""
+        return self.output.with_suffix(".preview.jpg") if self.alone else self.output / "preview.jpg"
+
     def main(self) -> None:
         if self.output.exists() and self.output.is_file() != self.alone:
             kind = "file" if self.output.is_file() else "folder"
             fix = "Name a file that ends in .html, or a folder that does not."
             raise InputError(f"--output {self.output} is a {kind}. {fix}")
         files = [self.output] if self.alone else [self.output / "index.html", self.output / SCENE]
+        files += [] if self.address is None else [self.picture]
         config = self.checked(*files)
         from nrfgs_ns.export.web.command import export_web
 

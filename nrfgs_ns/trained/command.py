@@ -4,6 +4,7 @@ training that a command line names, found before torch is imported."""
 
 import json
 from dataclasses import dataclass
+from glob import escape
 from pathlib import Path
 from time import sleep
 from types import SimpleNamespace
@@ -68,6 +69,8 @@ class Eval(NamesTraining):
     def main(self) -> None:
         path = self.config()
         check_writable(self.output_path, "--output-path")
+        if self.output_path.resolve() == path.resolve():
+            raise InputError(f"--output-path {path} would replace the training's file. Give it a name of its own.")
         if (pictures := self.render_output_path) is not None:
             check_writable(pictures / "eval.png", "--render-output-path")
         from nrfgs_ns.threads import draws_small, few_threads
@@ -127,7 +130,8 @@ def view_file(path: Path, config):
     model = load_file(path)
     model.viewer_panel = ViewerPanel(model)
     pipeline = SimpleNamespace(model=model, datamanager=SimpleNamespace(includes_time=False))
-    viewer = Viewer(config, path.parent / "viewer.log", datapath=path.parent, pipeline=pipeline)
+    beside = next(path.absolute().parent.glob(f"{escape(path.name)}.nerfstudio/*/compact"), path.parent)
+    viewer = Viewer(config, beside / "viewer.log", datapath=path.parent, pipeline=pipeline)
     viewer.camera_handles, viewer.original_c2w = {}, {}
     viewer.hide_images.visible = False
     viewer.make_stats_markdown = lambda _, resolution: f"Resolution: {resolution}"  # a file knows no step

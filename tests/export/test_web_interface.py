@@ -34,8 +34,7 @@ def test_views_set_through_the_interface_are_the_renderers(opened, tmp_path):
         page.call("setCamera", {"fov": 55} | view)
         by_target, matrix = page.picture(), page.call("getMatrix")
         pose, focal = np.reshape(matrix, (4, 4)).T[:3], SIZE[1] / 2 / np.tan(np.radians(view.get("fov", 55)) / 2)
-        lens = [focal, focal, SIZE[0] / 2, SIZE[1] / 2]
-        seen = {"pose": pose.flatten().tolist(), "lens": lens, "size": list(SIZE)}
+        seen = {"pose": pose.flatten().tolist(), "lens": [focal, focal, SIZE[0] / 2, SIZE[1] / 2], "size": list(SIZE)}
         assert psnr(by_target, rendered(scene, seen)) >= ALIKE
         page.call("visit", 1)
         page.call("setCamera", {"matrix": matrix, "fov": view.get("fov", 55)})

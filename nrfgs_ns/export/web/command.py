@@ -7,7 +7,7 @@ from operator import itemgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
-from urllib.parse import urljoin
+from urllib.parse import quote, urljoin
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -42,8 +42,8 @@ def export_web(load_config: Path, options: Web) -> None:
     with few_threads(draws_small(pipeline)):
         about, poster = surroundings(pipeline, names)
         title = output.stem if options.title is None else options.title
-        picture = output.with_suffix(".jpg") if alone else output / "preview.jpg"
-        preview = "" if address is None else urljoin(address if alone else f"{address}/", picture.name)
+        picture, below = options.picture, alone or address is None or address.endswith(".html")
+        preview = "" if address is None else urljoin(address if below else f"{address}/", quote(picture.name))
         around = len(page(about | guide, poster, b"" if alone else SCENE, title, options.author, preview).encode())
         with TemporaryDirectory() as temporary:
             file = Path(temporary) / SCENE

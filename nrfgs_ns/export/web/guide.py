@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from nrfgs_ns.errors import InputError, refusing, require
 
 VIEWS_A_SECOND = 5
@@ -85,7 +87,10 @@ def _camera(camera: Any, where: str) -> None:
     if not isinstance(camera, dict):
         raise InputError(f"{where} is no camera. Give it a position and a target.")
     if "matrix" in camera:
-        _numbers(camera["matrix"], 16, f"{where}.matrix")
+        axes = np.reshape(_numbers(camera["matrix"], 16, f"{where}.matrix"), (4, 4))[:3, :3]
+        turns = np.abs(axes @ axes.T - np.eye(3)).max() < 1e-3 and np.linalg.det(axes) > 0
+        if not turns or camera.get("position") or camera.get("target"):
+            raise InputError(f"{where}: a matrix must stand alone, and be a rotation and a position. Correct it.")
     elif _numbers(camera.get("position"), 3, f"{where}.position") == _numbers(
         camera.get("target"), 3, f"{where}.target"
     ):
@@ -98,7 +103,7 @@ def _camera(camera: Any, where: str) -> None:
 
 def _numbers(values: Any, count: int, where: str) -> list[float]:
     if isinstance(values, list) and len(values) == count:
-        if all(isinstance(value, int | float) and math.isfinite(value) for value in values):
+        if all(isinstance(value, int | float) and abs(value) < math.inf for value in values):
             return [float(f"{value:.7g}") for value in values]
     raise InputError(f"{where} must be {count} finite number{'s' if count > 1 else ''}, not {values}.")
 
