@@ -3,8 +3,6 @@
 between them, or on GPUs.
 
     python -m nrfgs_lab.many_processes METHOD --machine.num-devices 2 --machine.device-type cpu ...
-
-It takes the options of `ns-train`, for one machine.
 """
 
 import contextlib

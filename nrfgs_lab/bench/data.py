@@ -4,8 +4,7 @@
 - `transforms.json`: `nrfgs-data`, with the data set's own split if it names one.
 - A COLMAP model: nerfstudio's `colmap`. It counts images in the order of COLMAP's numbers, so the folder is mirrored by
   links into the work folder, beside lists of the names of each split.
-- Held out: a data set of the training views alone, at half the size, some of which are test views, in the work folder:
-  for choosing settings without looking at test views.
+- Held out: a data set, in the work folder, of the training views alone at half the size, some of them for testing.
 - Fewer views: the capture with its own test views and some of its training views.
 - A smaller size that the capture has no images of: they are made, since other projects' methods only read them.
 """
@@ -36,8 +35,7 @@ QUALITY = 92
 def parser_options(root: Path, scene: Scene, mirrors: Path) -> list[str]:
     """Name and options of the data parser, the last words of ns-train's command line.
 
-    Mirrored and held-out data sets are written below `mirrors`. InputError if the folder has neither layout, or the
-    downscaled images are missing.
+    Mirrored and held-out data sets are written below `mirrors`. InputError for another layout, or missing images.
     """
     folder = root / scene.path
     mirror = mirrors / scene.name.replace("/", ", ")  # a folder in a mirror may be a link
@@ -99,8 +97,12 @@ def select_views(folder: Path, out: Path, scene: Scene) -> None:
     with fewer training views, into `out`. InputError if the capture names no training views."""
     file = folder / "transforms.json"
     meta = transforms_of(folder)
+    if not any(key.endswith("_filenames") for key in meta):  # `nrfgs bench` tests every 8th from the first, then
+        every = sorted(frame["file_path"] for frame in meta.get("frames", ()))
+        test = every[::TEST_EVERY]
+        meta |= {"train_filenames": [n for n in every if n not in test], "val_filenames": test, "test_filenames": test}
     if not meta.get("train_filenames"):
-        raise InputError(f"{file} is missing, or names no train_filenames. Give a capture that nrfgs prepare wrote.")
+        raise InputError(f"{file} is missing, or has too few training views. Give a capture that nrfgs prepare wrote.")
     names = sorted(meta["train_filenames"])
     if scene.held_out is None:
         for entry in folder.iterdir():

@@ -27,9 +27,9 @@ APPEARANCE = "pipeline.model.appearance."
 INTRODUCTION = """# Options
 
 **This page explains the options that this package adds, with `nrfgs`'s defaults. `ns-train METHOD --help` lists all,
-also learning rates.** `nrfgs-sh`, `nrfgs-vdgs`, `nrfgs-gsnb` and `nrfgs-sg` turn off `view-noise`, `few-views`,
-`shrinkage`, `dense-start` and `near-plane`. They have splatfacto's densification and 30,000 steps without averaging.
-Cameras lie within [-1, 1] scene units.
+also learning rates.** `nrfgs-harmonics` turns off `few-views`. `nrfgs-sh`, `nrfgs-vdgs`, `nrfgs-gsnb` and `nrfgs-sg`
+turn off `view-noise`, `few-views`, `shrinkage`, `dense-start`, `near-plane` and `twin`. They have splatfacto's
+densification and 30,000 steps without averaging. Cameras lie within [-1, 1] scene units.
 """
 SPLATFACTOS = {field.name for field in dataclasses.fields(SplatfactoModelConfig)}
 """Options of splatfacto's model, not explained here."""

@@ -64,8 +64,7 @@ def test_a_constant_distance_is_what_the_field_sees(config):
     field, visible, _ = random_field(config)
     # From cameras that are all as far away from their splats.
     torch.manual_seed(0)
-    directions = torch.nn.functional.normalize(torch.randn(len(visible), 3), dim=-1)
-    centers = field.splats["means"][visible] + 3.0 * directions
+    centers = field.splats["means"][visible] + 3.0 * torch.nn.functional.normalize(torch.randn(len(visible), 3), dim=-1)
     _, log_distance = view_geometry(field.splats["means"][visible], centers, 0.01)
     small = ablation.with_constant_distance(field, float(log_distance[0]))
     assert not small.head.config.use_distance

@@ -47,6 +47,15 @@ def test_shipped_files_are_valid():
         assert {cell.run for cell in cells} == set(plan.runs) and {cell.scene for cell in cells} == set(plan.scenes)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("file, name", plans())
+def test_ns_train_takes_the_options_of_every_run(file, name, capsys):
+    plan = plans()[file, name]
+    for cell in {(cell.run, cell.strategy): cell for cell in cells_of(plan)}.values():
+        if cell.run.method not in ("harmonics-decay", "linear-basis", "linear-opacity"):  # methods of an earlier commit
+            parse(command(plan, cell, ["nrfgs-data", "--data", "x"], Path("w")))
+
+
 def test_which_trainings_a_plan_has():
     """The first seed of everything comes first, scene by scene, strategies together; runs may have their own scenes and
     steps, and another project's methods run as they are."""
@@ -230,8 +239,10 @@ def test_held_out_scenes_have_no_test_view_and_the_same_cameras_at_half_the_size
     with pytest.raises(InputError, match="holds out none"):
         made(Scene("tiny", held_out=30, held_out_by="place"))
     (source / "transforms.json").write_text(json.dumps({**whole, "train_filenames": []}))
-    with pytest.raises(InputError, match="train_filenames"):
+    with pytest.raises(InputError, match="too few training views"):
         parser_options(source.parent, Scene("tiny", held_out=3), tmp_path / "mirrors")
+    (source / "transforms.json").write_text(json.dumps({"frames": whole["frames"]}))
+    assert made(Scene("tiny", views=2))[1]["test_filenames"] == names[::8]
 
 
 @pytest.mark.parametrize("views", [None, 4])
@@ -252,8 +263,7 @@ def test_smaller_images_are_there_for_methods_that_only_read_them(views, tiny_sc
     (source / "transforms.json").write_text(json.dumps(meta))
     scene = Scene("tiny", downscale=2, views=views)
     resized = load(["nrfgs-data", "--data", str(source), "--downscale-factor", "2"]).train_dataset
-    folder = Path(parser_options(source.parent, scene, tmp_path / "mirrors")[2])
-    (folder / "images_2" / Path(names[3]).name).unlink()
+    (Path(parser_options(source.parent, scene, tmp_path / "mirrors")[2]) / "images_2" / Path(names[3]).name).unlink()
     read = load(parser_options(source.parent, scene, tmp_path / "mirrors")).train_dataset
     assert {path.parent.name for path in read.image_filenames} == {"images_2"}
     twins = {path.name: index for index, path in enumerate(resized.image_filenames)}

@@ -16,6 +16,7 @@ from nerfstudio.plugins.registry import discover_methods
 from nerfstudio.utils import eval_utils
 from short_trainings import command_line, recorded
 
+from nrfgs_lab.bench.file import load_spec
 from nrfgs_lab.bench.spec import is_ours
 from nrfgs_lab.pages import site, tables
 from nrfgs_lab.pages.figures import FIGURES
@@ -155,6 +156,8 @@ def test_commands_that_pages_show_are_understood():
         program, first, *rest = shlex.split(line)
         try:
             with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-                parse([first, *rest]) if program == "ns-train" else tyro.cli(commands()[first].load(), args=rest)
+                made = parse([first, *rest]) if program == "ns-train" else tyro.cli(commands()[first].load(), args=rest)
+            if first == "bench" and made.spec.name != "FILE":
+                assert load_spec(made.spec, made.plan)
         except SystemExit as end:
             assert not end.code, line
