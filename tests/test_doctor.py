@@ -86,8 +86,7 @@ def test_kernels_that_fail_are_told_apart(monkeypatch):
         monkeypatch.setattr(owner, name, lambda _: True)
     monkeypatch.setattr("nrfgs_ns.appearance.nrf.NeuralResidualField.try_kernels", lambda *_: None)
     assert [(finding.fix, finding.broken) for finding in doctor.kernels(CPU)] == [("", False)] * 2
-    trial = Mock(side_effect=OSError("no compiler"))
-    monkeypatch.setattr(ssim, "kernels_run_on", tried_once("SSIM")(trial))
+    monkeypatch.setattr(ssim, "kernels_run_on", tried_once("SSIM")(Mock(side_effect=OSError("no compiler"))))
     gsplat, triton = doctor.kernels(CPU)
     assert not gsplat.fix and not triton.broken and "SSIM" in triton.fix and "no compiler" in triton.fix
     monkeypatch.setattr(pipeline, "load_kernels", Mock(side_effect=ImportError("no nvcc")))

@@ -95,8 +95,7 @@ def sg_by_hand(splats, visible, centers):
         lobes = zip(*(splats[name][row].tolist() for name in ("sg_axes", "sg_sharpness", "sg_colors")), strict=True)
         for axis, sharpness, amplitude in lobes:
             cosine = sum(a * b for a, b in zip(axis, d, strict=True)) / math.hypot(*axis)
-            height = math.exp(abs(sharpness) * (cosine - 1))
-            color = [c + a * height for c, a in zip(color, amplitude, strict=True)]
+            color = [c + a * math.exp(abs(sharpness) * (cosine - 1)) for c, a in zip(color, amplitude, strict=True)]
         colors.append([max(0.0, c) for c in color])
     return torch.tensor(colors, dtype=torch.double)
 

@@ -100,8 +100,7 @@ def test_opacity_logits_to_both_ends(head, logit):
 @given(latent=st.floats(-3, 4), weight=st.floats(-3, 4), distance=st.floats(-18, 18), seed=st.integers(0, 99))
 def test_latents_and_weights_together(head, latent, weight, distance, seed):
     """To 1e4 each, the largest sum is some 1e4 * 64 * (1e4 * 48 * 1e4) = 3e17, and gradients are 1e13 at most."""
-    extreme = Extreme(latent=10.0**latent, weight=10.0**weight, distance=10.0**distance)
-    assert_healthy(*build(head, extreme, seed=seed))
+    assert_healthy(*build(head, Extreme(latent=10.0**latent, weight=10.0**weight, distance=10.0**distance), seed=seed))
 
 
 @pytest.mark.parametrize("head", HEADS)
@@ -161,8 +160,7 @@ def test_direction_distance_and_bands_agree_with_float64(exponent, seed):
     assert ((log_r.double() - exact_log_r).abs() <= 6 * U + U * exact_log_r.abs()).all()
     bands, exact_bands = (torch.cat(fourier_bands(x, 6), dim=1)[:, 3:] for x in (d, exact_d))
     for k in range(6):
-        error = (bands.double() - exact_bands)[:, 6 * k : 6 * k + 6].abs()
-        assert (error <= 2.0**k * math.pi * 10 * U + 2 * U).all()
+        assert ((bands.double() - exact_bands)[:, 6 * k : 6 * k + 6].abs() <= 2.0**k * math.pi * 10 * U + 2 * U).all()
 
 
 @settings(max_examples=60, derandomize=True)

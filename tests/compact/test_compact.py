@@ -40,8 +40,7 @@ def test_morton_interleaves_and_back(seed, count):
     interleaved = morton(codes)
     assert (from_morton(interleaved) == codes).all()
     for row, number in zip(codes[:3], interleaved, strict=False):  # by hand, bit for bit
-        by_hand = sum(((int(row[axis]) >> k) & 1) << (3 * k + axis) for k in range(21) for axis in range(3))
-        assert by_hand == int(number)
+        assert sum(((int(row[axis]) >> k) & 1) << (3 * k + axis) for k in range(21) for axis in range(3)) == int(number)
 
 
 @given(seed=st.integers(0, 99))

@@ -29,8 +29,7 @@ def test_several_blocks_and_strips(monkeypatch):
     monkeypatch.setattr(ssim_triton, "COLUMNS", 32)
     monkeypatch.setattr(ssim_triton, "ROWS", 6)
     prediction, truth = pair(12, 18)
-    loss = ssim_triton.WeightedSum.apply(prediction, truth, 0.8, -0.2, 0.2)
-    assert_near(loss, prediction, truth, 0.2, TOLERANCE)
+    assert_near(ssim_triton.WeightedSum.apply(prediction, truth, 0.8, -0.2, 0.2), prediction, truth, 0.2, TOLERANCE)
 
 
 def test_one_window_and_upstream_gradient(monkeypatch):
@@ -57,8 +56,7 @@ def test_the_kernel_remembers_what_its_twin_remembers(wanted, visible):
     tables = torch.rand(400) / 50, torch.rand(400) * 300, torch.rand(400) - 1.0
     mine = Statistics(*(table if want else None for table, want in zip(tables, wanted, strict=True)))
     theirs = Statistics(*(None if value is None else value.clone() for value in mine))
-    info = {"gaussian_ids": rows, "radii": radii, "width": 400, "height": 300}
-    shown = info, (400.0, 300.0), gradients
+    shown = {"gaussian_ids": rows, "radii": radii, "width": 400, "height": 300}, (400.0, 300.0), gradients
     in_triton(mine, *shown)
     in_torch(theirs, *shown)
     for value, twin in zip(mine, theirs, strict=True):

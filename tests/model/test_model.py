@@ -128,11 +128,9 @@ def test_a_camera_on_the_gpu_is_asked_once_until_it_is_written_to():
 @pytest.mark.parametrize("count", [1, 2, 3, 5])
 def test_few_or_duplicate_points_start_finite(build, count):
     """Splatfacto asks for three neighbours and takes the logarithm of their distance."""
-    pipeline = build()
-    model = pipeline.model
+    model = build().model
     model.seed_points = (torch.zeros(count, 3), torch.full((count, 3), 100, dtype=torch.uint8))
-    splats = model._initial_splats()
-    assert all(len(value) == count and torch.isfinite(value).all() for value in splats.values())
+    assert all(len(value) == count and torch.isfinite(value).all() for value in model._initial_splats().values())
 
 
 @pytest.mark.parametrize("masked", [False, True])

@@ -45,8 +45,7 @@ def test_contributions_to_hard_cases(name, device):
     verdict = judge(case, (upper.abs(), torch.zeros_like(alphas)), bounds=BOUNDS[device])
 
     means, quats, scales, opacities, _, viewmats, Ks = (t.to(device) for t in case.arguments()[:-2])
-    options = ProjectionOptions(**case.options)
-    projection = project(means, quats, scales, viewmats, Ks, case.width, case.height, options)
+    projection = project(means, quats, scales, viewmats, Ks, case.width, case.height, ProjectionOptions(**case.options))
     shares = contributions(projection, opacities[projection.gaussian_ids])
     assert not shares.requires_grad
     total = torch.zeros(len(viewmats), len(means), dtype=torch.float64)
