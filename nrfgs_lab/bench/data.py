@@ -105,11 +105,13 @@ def select_views(folder: Path, out: Path, scene: Scene) -> None:
         raise InputError(f"{file} is missing, or has too few training views. Give a capture that nrfgs prepare wrote.")
     names = sorted(meta["train_filenames"])
     if scene.held_out is None:
-        for entry in folder.iterdir():
-            if entry != file:
-                (out / entry.name).symlink_to(entry.resolve())
+        for entry in {*folder.iterdir()} - {file}:
+            (out / entry.name).symlink_to(entry.resolve())
     else:
         frames = [frame for frame in meta["frames"] if frame["file_path"] in names]
+        files = [Path(frame[key]) for frame in frames for key in ("file_path", "mask_path") if key in frame]
+        if any(name.is_absolute() or ".." in name.parts for name in files):  # which halves would replace
+            raise InputError(f"{file} names photographs elsewhere. Give a capture that nrfgs prepare wrote.")
         meta |= {"frames": sorted(frames, key=lambda frame: frame["file_path"])}
         _halve(meta, folder, out)
         if scene.held_out_by == "place":

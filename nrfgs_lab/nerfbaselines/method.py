@@ -207,8 +207,7 @@ def configure(method: str, overrides: dict[str, Any], metadata: dict[str, Any]) 
     """
     words = []
     if (color := metadata.get("background_color")) is not None:
-        names = {(0, 0, 0): "black", (255, 255, 255): "white"}
-        name = names.get(tuple(np.asarray(color).tolist()))
+        name = {(0, 0, 0): "black", (255, 255, 255): "white"}.get(tuple(np.asarray(color).tolist()))
         if name is None:
             raise InputError(f"The data set's background is {np.asarray(color)}; only black and white are known.")
         words = ["--pipeline.model.background_color", name]

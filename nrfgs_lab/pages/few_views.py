@@ -174,8 +174,7 @@ def sparse() -> str:
     body = []
     for scene, (views, published) in SPARSE.items():
         runs, theirs = sparse_runs(scene), trainings("twenty-four", scene, HOST, OWN)
-        label = f"{scene.rpartition('_')[2]}, {views}"
-        body.append([label, *map(cell, runs), cell(theirs), published])
+        body.append([f"{scene.rpartition('_')[2]}, {views}", *map(cell, runs), cell(theirs), published])
     return grid(["training views", "`nrfgs`", "harmonics", HOST, "3DGS, published"], body)
 
 

@@ -202,8 +202,9 @@ class NrfgsDataParser(DataParser):
         if named and "train" not in named:
             given, _ = next(iter(named.values()))  # such as test_filenames or test_list.txt
             raise InputError(f"{source} has {given}, but no train_{given.partition('_')[2]}. Name the training images.")
-        if named and (rule := self.config.eval_mode) != NrfgsDataParserConfig.eval_mode:
-            warn(f"{source} names its test images, so --eval-mode {rule} changes nothing. Remove the lists for it.")
+        if named and (rule := self.config.eval_mode) != type(self.config).eval_mode:
+            lists = ", ".join(name for name, _ in named.values())
+            warn(f"--eval-mode {rule} changes nothing, since the data set has lists of images ({lists}): remove them.")
         splits = (
             split_by_names(named, paths, self._path, source) if named else split_by_rule(self.config, paths, source)
         )

@@ -171,8 +171,8 @@ def write_config(load_config: Path, output: Path, head: NrfConfig) -> Path:
     config.pipeline.model.camera_optimizer.mode = "off"
     models = config.get_checkpoint_dir()
     models.mkdir(parents=True, exist_ok=True)
-    for older in models.parents[2].glob("*/compact/**/*"):  # of another method's file of this name, too
-        if older.is_file():
+    for written in ("config.yml", f"{models.name}/step-*.ckpt"):
+        for older in models.parents[2].glob(f"*/compact/{written}"):  # of another method's file of this name, too
             older.unlink()
     step = max(config.max_num_iterations, 1) - 1
     torch.save({"step": step, "pipeline": {}}, models / f"step-{step:09d}.ckpt")

@@ -68,11 +68,12 @@ def test_text_as_nerfstudio(tmp_path, options):
     same_as_nerfstudio(Model().write(tmp_path / "scene", text=True), **options)
 
 
-def test_lists_of_splits(scene):
+def test_lists_of_splits(scene, printed):
     for split, numbers in (("train", (1, 2, 5)), ("test", (0, 9))):
         (scene / f"{split}_list.txt").write_text("".join(f"{i:03d}.png\n" for i in numbers))
     assert [path.name for path in parse(scene).image_filenames] == ["001.png", "002.png", "005.png"]
     assert [path.name for path in parse(scene, "val").image_filenames] == ["000.png", "009.png"]
+    assert "--eval-mode" not in printed()
     (scene / "train_list.txt").unlink()
     with pytest.raises(InputError, match=r"test_list.txt, but no train_list.txt"):
         parse(scene)

@@ -37,8 +37,7 @@ def errors(size: int, scale: float = 1.0, views: int = 2, cameras_at_once: bool 
     K = torch.tensor([[1.5 * size, 0.0, size / 2], [0.0, 1.5 * size, size / 2], [0.0, 0.0, 1.0]])
     y = (torch.arange(size) + 0.5) / size
     truth = torch.stack([y[None].expand(size, size), y[:, None].expand(size, size), 0 * y[None] + y[:, None]], -1)
-    groups = [poses] if cameras_at_once else poses[:, None]
-    for group in groups:
+    for group in [poses] if cameras_at_once else poses[:, None]:
         intrinsics = K.expand(len(group), 3, 3)
         projection = project((scale * means).requires_grad_(), quats, scale * scales, group, intrinsics, size, size)
         rows = projection.gaussian_ids
@@ -99,8 +98,7 @@ def test_halves_keep_each_axis_variance_and_the_opacity(places):
     table.check()
     assert len(table) == 8 - len(places)
     assert all(table.splats[name] is value for name, value in held.items()) == (len(places) == 2)
-    others = [*places, *range(6, 8 - len(places))]
-    for row, other in zip(rows.tolist(), others, strict=True):
+    for row, other in zip(rows.tolist(), [*places, *range(6, 8 - len(places))], strict=True):
         means = table.splats["means"].detach()
         assert_close((means[row] + means[other]) / 2, before["means"][row])
         offset = rotations(before["quats"])[row].T @ (means[row] - before["means"][row])

@@ -39,8 +39,7 @@ def trainer_of(scene: Path, out: Path, world: int, method: str = "nrfgs", **opti
     from nrfgs_lab.training_run import parse, set_up
 
     loud = {"--pipeline.model.appearance.output-init": "default"} if method == "nrfgs" else {}
-    config = parse(command_line(method, scene, out, None, COMMON, options, loud))
-    return set_up(config, dist.get_rank(), world)
+    return set_up(parse(command_line(method, scene, out, None, COMMON, options, loud)), dist.get_rank(), world)
 
 
 def precise(trainer) -> None:

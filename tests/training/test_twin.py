@@ -121,8 +121,7 @@ def test_a_pull_is_the_gradient_of_the_loss_against_the_others_picture(tiny_scen
 
     def loss(features):
         model.gauss_params["features_dc"].data = features
-        rgb = model.get_outputs(view)["rgb"]
-        return photometric_loss(rgb, truth, model.config.ssim_lambda).item()
+        return photometric_loss(model.get_outputs(view)["rgb"], truth, model.config.ssim_lambda).item()
 
     parameter = model.gauss_params["features_dc"]
     start, gradient = parameter.data.clone(), gradients[parameter]

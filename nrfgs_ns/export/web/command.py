@@ -42,7 +42,7 @@ def export_web(load_config: Path, options: Web) -> None:
     with few_threads(draws_small(pipeline)):
         about, poster = surroundings(pipeline, names)
         title = output.stem if options.title is None else options.title
-        picture, below = options.picture, alone or address is None or address.endswith(".html")
+        picture, below = options.picture, alone or address is None or address.lower().endswith((".html", ".htm"))
         preview = "" if address is None else urljoin(address if below else f"{address}/", quote(picture.name))
         around = len(page(about | guide, poster, b"" if alone else SCENE, title, options.author, preview).encode())
         with TemporaryDirectory() as temporary:

@@ -3,6 +3,7 @@
 
 import json
 import math
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -103,7 +104,7 @@ def _camera(camera: Any, where: str) -> None:
 
 def _numbers(values: Any, count: int, where: str) -> list[float]:
     if isinstance(values, list) and len(values) == count:
-        if all(isinstance(value, int | float) and abs(value) < math.inf for value in values):
+        if all(isinstance(value, int | float) and abs(value) <= sys.float_info.max for value in values):
             return [float(f"{value:.7g}") for value in values]
     raise InputError(f"{where} must be {count} finite number{'s' if count > 1 else ''}, not {values}.")
 

@@ -243,6 +243,10 @@ def test_held_out_scenes_have_no_test_view_and_the_same_cameras_at_half_the_size
         parser_options(source.parent, Scene("tiny", held_out=3), tmp_path / "mirrors")
     (source / "transforms.json").write_text(json.dumps({"frames": whole["frames"]}))
     assert made(Scene("tiny", views=2))[1]["test_filenames"] == names[::8]
+    frames = [{**frame, "file_path": str(source / frame["file_path"])} for frame in whole["frames"]]
+    (source / "transforms.json").write_text(json.dumps({"frames": frames}))
+    with pytest.raises(InputError, match="photographs elsewhere"):
+        made(Scene("tiny", held_out=3))
 
 
 @pytest.mark.parametrize("views", [None, 4])
