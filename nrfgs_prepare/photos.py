@@ -128,7 +128,8 @@ def _store(image: Image.Image, path: Path, target: Path) -> None:
 
 
 def exif_of_copy(exif: Image.Exif) -> bytes:
-    """The camera, exposure, date and position of a turned copy, for PIL's `exif` option."""
+    """The camera, exposure, date and position of a turned copy, for PIL's `exif` option; empty if PIL cannot write
+    them."""
     copy = Image.Exif()
     details = exif.get_ifd(ExifTags.IFD.Exif)
     copy.update({tag: exif[tag] for tag in KEPT_TAGS if tag in exif})

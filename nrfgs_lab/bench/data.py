@@ -94,7 +94,7 @@ def by_place(names: list[str], frames: list[dict]) -> list[str]:
 
 def select_views(folder: Path, out: Path, scene: Scene) -> None:
     """Write a data set of a capture's training views at half the size, some of them held out, or of the whole capture
-    with fewer training views, into `out`. InputError if the capture names no training views."""
+    with fewer training views, into `out`. InputError if it has too few, or photographs elsewhere to be halved."""
     file = folder / "transforms.json"
     meta = transforms_of(folder)
     if not any(key.endswith("_filenames") for key in meta):  # `nrfgs bench` tests every 8th from the first, then

@@ -112,7 +112,7 @@ class NrfgsDataParser(DataParser):
         images, masks = (self._files(frames, key, data_set.factor) for key in FOLDERS)
         cameras = data_set.cameras[torch.from_numpy(rows)]
         copies = all(self._has_copies(key, data_set.factor) for key in FOLDERS if key in frames[0])
-        # Smaller copies have often lost it.
+        # Smaller copies have often lost their EXIF.
         full_size_exif = lambda frame: read_exif(self._path(frame["file_path"])) if copies else {}  # noqa: E731
         corner = torch.full((3,), self.config.scene_scale)
         outputs = PlacedOutputs(
